@@ -1,0 +1,296 @@
+"""Every parameter of the system: typed, frozen, with its unit, range and meaning.
+
+The dataclasses below are the single source: YAML presets override them, ``--set key=value`` overrides YAML, the nodes
+declare the same names as ROS parameters, and each run writes back what it used. An unknown key, a wrong type or a
+value out of range is a :class:`~hat_ros.errors.ConfigError` that names the key and the nearest known one.
+
+Symbols in parentheses are the paper's. ``*_px`` are pixels, ``*_deg`` degrees, ``*_m`` metres, ``*_s`` seconds; frame
+counts are input frames.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import sys
+import types
+import typing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from hat_ros.errors import ConfigError
+
+
+def option(
+    default: Any, doc: str, *, low: float | None = None, high: float | None = None, choices: tuple[str, ...] = ()
+) -> Any:
+    """A parameter with its one-line description and what values it accepts."""
+    return field(default=default, metadata={"doc": doc, "low": low, "high": high, "choices": choices})
+
+
+@dataclass(frozen=True)
+class KeyframeConfig:
+    """When candidates are generated."""
+
+    gap_frames: int = option(6, "frames from one anchor attempt to the next", low=1)
+
+
+@dataclass(frozen=True)
+class SegmentationConfig:
+    """Stage 1."""
+
+    backend: str = option("classical", "classical, annotated or mask2former")
+    box_padding: float = option(0.0, "share of width/height added on each side of a given box", low=0, high=1)
+
+
+@dataclass(frozen=True)
+class TemplateConfig:
+    """Training-free hypotheses: view bank and refinement."""
+
+    n_views: int = option(642, "view directions on the sphere (icosphere sizes: 162, 642, 2562)")
+
+
+@dataclass(frozen=True)
+class HypothesesConfig:
+    """Stage 2."""
+
+    backend: str = option("template", "template, megapose, picopose or gigapose")
+    max_candidates: int = option(10, "K: pose hypotheses per keyframe", low=1, high=64)
+    guard: bool = option(False, "drop implausible candidates (score, depth, range) before selection")
+    template: TemplateConfig = field(default_factory=TemplateConfig)
+
+
+@dataclass(frozen=True)
+class FeatureSlamConfig:
+    """Training-free target-relative motion."""
+
+    max_points: int = option(200, "point tracks kept alive", low=16, high=2000)
+
+
+@dataclass(frozen=True)
+class SlamConfig:
+    """Target-relative motion."""
+
+    backend: str = option("feature", "feature or droid")
+    masked: bool = option(True, "suppress the background; false for a static scene seen by a moving camera")
+    feature: FeatureSlamConfig = field(default_factory=FeatureSlamConfig)
+
+
+@dataclass(frozen=True)
+class SelectorConfig:
+    """Stage 3: causal Viterbi selection."""
+
+    score_scale: float = option(3.0, "alpha: scale of the appearance score", low=0)
+    motion_weight_per_deg: float = option(0.3, "mu: penalty per degree of disagreement with the motion", low=0)
+    warmup_keyframes: int = option(3, "the decoder's choice counts from this keyframe on; appearance before", low=1)
+    running_gate: bool = option(False, "fall back to appearance while the candidates look unreliable")
+    gate_neighbourhood_deg: float = option(15.0, "candidates this close to the best one count as its support", low=0)
+    gate_min_median_support: float = option(2.0, "running median of the support that the decoder needs", low=0)
+    gate_max_override_share: float = option(0.7, "running share of overridden keyframes it may reach", low=0, high=1)
+    size_weighting: bool = option(False, "weight appearance by apparent size, eq. (sizew)")
+    size_ref_px: float = option(500.0, "s0: apparent size of unit weight", low=1e-6)
+    size_exponent: float = option(2.0, "gamma of the size weight", low=0)
+    size_weight_min: float = option(0.05, "w_min: floor of the size weight", low=0, high=1)
+
+
+@dataclass(frozen=True)
+class AlignmentConfig:
+    """Stage 4a: Sim(3) from SLAM to metric target coordinates."""
+
+    lever_m_per_rad: float = option(1.0, "lambda: metres per radian in all residuals", low=1e-9)
+    min_observations: int = option(3, "joint anchor/SLAM observations of the first fit", low=3)
+    refit_interval_frames: int = option(10, "frames between refits", low=1)
+    max_observations: int = option(256, "observations kept for refits; older ones are thinned evenly", low=8)
+    rejection_factor: float = option(3.0, "outliers lie beyond this factor of the inliers' median residual", low=1)
+    first_rejection_rounds: int = option(3, "outlier rounds of the first fit", low=0)
+    refit_rejection_rounds: int = option(1, "outlier rounds of a refit", low=0)
+    reset_anchors: int = option(4, "coherent disagreeing anchors in a row that drop the alignment", low=1)
+
+
+@dataclass(frozen=True)
+class FusionConfig:
+    """Stage 4b: the causal pose."""
+
+    relative_weight: float = option(0.1, "w: weight of the relative-motion residual", low=0)
+    gate_angle_deg: float = option(30.0, "D: anchor and aligned SLAM rotation disagree beyond this angle", low=0)
+    gate_weight: float = option(0.05, "g of a disagreeing anchor", low=0, high=1)
+    huber_delta_m: float = option(0.3, "delta: scale of the componentwise Huber loss", low=1e-9)
+    loss: str = option("huber", "huber or linear (squared)", choices=("huber", "linear"))
+    warmup_observations: int = option(4, "joint observations since the last reset before fusion runs", low=1)
+    confidence: str = option("uniform", "uniform or detection_area", choices=("uniform", "detection_area"))
+    confidence_exponent: float = option(1.0, "power of the relative detection area", low=0)
+    gap_fill: str = option("hold", "hold, or rotate: SLAM rotation with held translation", choices=("hold", "rotate"))
+    coast_limit_frames: int = option(60, "frames without a measurement after which the target is LOST", low=1)
+
+
+@dataclass(frozen=True)
+class RefinementConfig:
+    """Refinement of every fused pose on its own image (the paper's dense refinement, causal)."""
+
+    enabled: bool = option(False, "refine the fused pose on the current image")
+
+
+@dataclass(frozen=True)
+class PriorConfig:
+    """Fused poses of the past as a hint to the front ends (DESIGN 5.4)."""
+
+    enabled: bool = option(False, "let segmentation, hypotheses and slam see past fused poses")
+    delay_frames: int = option(4, "youngest fused pose they may see; never less than the credits W", low=1, high=64)
+
+
+@dataclass(frozen=True)
+class GraphConfig:
+    """The ROS graph."""
+
+    credits_replay: int = option(4, "W: frames in flight during replay", low=1, high=16)
+    stage_timeout_s: float = option(30.0, "a stage that does not answer in this time is an error", low=0.1)
+
+
+@dataclass(frozen=True)
+class HatConfig:
+    """The whole configuration; one attribute per section of the YAML file."""
+
+    keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
+    segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
+    hypotheses: HypothesesConfig = field(default_factory=HypothesesConfig)
+    slam: SlamConfig = field(default_factory=SlamConfig)
+    selector: SelectorConfig = field(default_factory=SelectorConfig)
+    alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
+    fusion: FusionConfig = field(default_factory=FusionConfig)
+    refinement: RefinementConfig = field(default_factory=RefinementConfig)
+    prior: PriorConfig = field(default_factory=PriorConfig)
+    graph: GraphConfig = field(default_factory=GraphConfig)
+
+    def __post_init__(self) -> None:
+        if self.prior.enabled and self.prior.delay_frames < self.graph.credits_replay:
+            raise ConfigError(
+                f"prior.delay_frames is {self.prior.delay_frames} but must be at least graph.credits_replay "
+                f"({self.graph.credits_replay}): a prior may never depend on a frame still in flight"
+            )
+
+
+def preset_folder() -> Path:
+    """Folder of the presets: beside the package in a checkout, under share/ when installed."""
+    candidates = [
+        Path(__file__).resolve().parent.parent / "config",
+        Path(sys.prefix) / "share" / "hat_ros" / "config",
+        # colcon: <prefix>/lib/pythonX.Y/site-packages/hat_ros/config.py
+        Path(__file__).resolve().parents[4] / "share" / "hat_ros" / "config",
+    ]
+    for folder in candidates:
+        if (folder / "default.yaml").is_file():
+            return folder
+    raise ConfigError(f"no preset folder found, looked in: {', '.join(map(str, candidates))}")
+
+
+def preset_names() -> list[str]:
+    """Names accepted by ``--config`` besides files."""
+    return sorted(path.stem for path in preset_folder().glob("*.yaml"))
+
+
+def load_config(name_or_file: str | Path = "default", overrides: typing.Sequence[str] = ()) -> HatConfig:
+    """Read a preset by name or a YAML file, then apply ``section.key=value`` overrides (values are YAML).
+
+    Raises:
+        ConfigError: no such preset or file, not a mapping, unknown key, wrong type, value out of range.
+    """
+    text = str(name_or_file)
+    path = Path(text) if text.endswith((".yaml", ".yml")) else preset_folder() / f"{text}.yaml"
+    if not path.is_file():
+        raise ConfigError(f"no configuration '{text}': presets are {', '.join(preset_names())}, or give a .yaml file")
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
+    if data is None:
+        data = {}
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: the top level must be a mapping of sections, found {type(data).__name__}")
+    for override in overrides:
+        _apply_override(data, override)
+    return config_from_dict(data)
+
+
+def _apply_override(data: dict[str, Any], override: str) -> None:
+    key, separator, value = override.partition("=")
+    if not separator or not key:
+        raise ConfigError(f"override '{override}' must have the form section.key=value")
+    *sections, last = key.strip().split(".")
+    node = data
+    for section in sections:
+        node = node.setdefault(section, {})
+        if not isinstance(node, dict):
+            raise ConfigError(f"override '{override}': '{section}' is a value, not a section")
+    try:
+        node[last] = yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise ConfigError(f"override '{override}': the value is not valid YAML") from None
+
+
+def config_from_dict(data: dict[str, Any]) -> HatConfig:
+    """Typed configuration from nested mappings; anything missing keeps its default.
+
+    Raises:
+        ConfigError: unknown key, wrong type, value out of range.
+    """
+    return _build(HatConfig, data, "")
+
+
+def config_to_dict(config: HatConfig) -> dict[str, Any]:
+    """Nested plain mappings, complete, in declaration order."""
+    return dataclasses.asdict(config)
+
+
+def flat_options(section: Any = None, prefix: str = "") -> dict[str, tuple[Any, dataclasses.Field[Any]]]:
+    """Dotted name -> (value, field) of every parameter; what the nodes declare as ROS parameters."""
+    section = HatConfig() if section is None else section
+    out: dict[str, tuple[Any, dataclasses.Field[Any]]] = {}
+    for item in dataclasses.fields(section):
+        value = getattr(section, item.name)
+        if dataclasses.is_dataclass(value):
+            out.update(flat_options(value, f"{prefix}{item.name}."))
+        else:
+            out[f"{prefix}{item.name}"] = (value, item)
+    return out
+
+
+def _build(cls: type, data: Any, prefix: str) -> Any:
+    if not isinstance(data, dict):
+        raise ConfigError(f"{prefix.rstrip('.') or 'configuration'}: expected a mapping, found {data!r}")
+    known = {item.name: item for item in dataclasses.fields(cls)}
+    hints = typing.get_type_hints(cls)
+    values = {}
+    for key, value in data.items():
+        if key not in known:
+            close = difflib.get_close_matches(str(key), known, n=1)
+            advice = f"did you mean '{prefix}{close[0]}'?" if close else f"known keys: {', '.join(sorted(known))}"
+            raise ConfigError(f"unknown key '{prefix}{key}': {advice}")
+        if dataclasses.is_dataclass(hints[key]):
+            values[key] = _build(hints[key], value, f"{prefix}{key}.")
+        else:
+            values[key] = _check(f"{prefix}{key}", value, hints[key], known[key].metadata)
+    return cls(**values)
+
+
+def _check(name: str, value: Any, hint: Any, metadata: typing.Mapping[str, Any]) -> Any:
+    if isinstance(hint, types.UnionType):
+        if value is None and type(None) in hint.__args__:
+            return None
+        hint = next(arg for arg in hint.__args__ if arg is not type(None))
+    accepts = {float: (int, float), int: (int,), bool: (bool,), str: (str,)}[hint]
+    if not isinstance(value, accepts) or (isinstance(value, bool) and hint is not bool):
+        raise ConfigError(f"{name}: expected {hint.__name__}, found {value!r} ({type(value).__name__})")
+    value = hint(value)
+    low, high, choices = metadata.get("low"), metadata.get("high"), metadata.get("choices")
+    if hint is float and value != value:
+        raise ConfigError(f"{name}: must be a number, found NaN")
+    if low is not None and value < low:
+        raise ConfigError(f"{name}: must be at least {low}, found {value}")
+    if high is not None and value > high:
+        raise ConfigError(f"{name}: must be at most {high}, found {value}")
+    if choices and value not in choices:
+        raise ConfigError(f"{name}: must be one of {', '.join(choices)}, found '{value}'")
+    return value

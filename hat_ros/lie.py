@@ -1,0 +1,141 @@
+"""Rotations and rigid transforms: SO(3), SE(3), Sim(3) in numpy, batched over leading axes.
+
+``T_a_b`` maps b-coordinates into a. Rotation vectors are radians. Quaternions are ``quat_xyzw`` (scalar last, as in
+ROS). Between stages a pose travels as one *pose row* ``[x, y, z, qx, qy, qz, qw]``, so that a message and a value in
+memory carry the same bits; matrices are always derived from rows by :func:`matrix_from_row`.
+
+Formulas: Sola, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics", arXiv:1812.01537 (equation
+numbers below); quaternion extraction after Shepperd, J. Guidance and Control 1 (1978).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# Below this squared angle sin(x)/x and its relatives are taken from their series: the next term is under 1e-17.
+_SMALL_ANGLE_SQ = 1e-8
+
+
+def hat(v: Array) -> Array:
+    """Skew matrix ``[v]x``: (..., 3) -> (..., 3, 3)."""
+    v = np.asarray(v, dtype=np.float64)
+    out = np.zeros(v.shape[:-1] + (3, 3))
+    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
+    return out
+
+
+def so3_exp(rotvec: Array) -> Array:
+    """Rotation matrix of a rotation vector (eq. 132): (..., 3) -> (..., 3, 3)."""
+    rotvec = np.asarray(rotvec, dtype=np.float64)
+    angle_sq = np.sum(rotvec * rotvec, axis=-1)
+    small = angle_sq < _SMALL_ANGLE_SQ
+    safe = np.where(small, 1.0, angle_sq)
+    angle = np.sqrt(safe)
+    a = np.where(small, 1.0 - angle_sq / 6.0, np.sin(angle) / angle)
+    b = np.where(small, 0.5 - angle_sq / 24.0, (1.0 - np.cos(angle)) / safe)
+    k = hat(rotvec)
+    return np.eye(3) + a[..., None, None] * k + b[..., None, None] * (k @ k)
+
+
+def so3_log(R: Array) -> Array:
+    """Rotation vector of a rotation matrix, angle in [0, pi]: (..., 3, 3) -> (..., 3).
+
+    Goes through the quaternion, which stays well conditioned up to and at 180 degrees.
+    """
+    q = quat_from_matrix(R)
+    norm = np.linalg.norm(q[..., :3], axis=-1)
+    angle = 2.0 * np.arctan2(norm, q[..., 3])
+    small = norm < 1e-9
+    factor = np.where(small, 2.0, angle / np.where(small, 1.0, norm))
+    return factor[..., None] * q[..., :3]
+
+
+def rotation_angle(R: Array) -> Array:
+    """Smallest rotation angle in radians, in [0, pi]: (..., 3, 3) -> (...)."""
+    q = quat_from_matrix(R)
+    return 2.0 * np.arctan2(np.linalg.norm(q[..., :3], axis=-1), q[..., 3])
+
+
+def angle_between(R_a: Array, R_b: Array) -> Array:
+    """Angle in radians between two rotations: (..., 3, 3), (..., 3, 3) -> (...)."""
+    return rotation_angle(np.asarray(R_a) @ np.swapaxes(np.asarray(R_b), -1, -2))
+
+
+def quat_from_matrix(R: Array) -> Array:
+    """Unit quaternion xyzw with qw >= 0 of a rotation matrix: (..., 3, 3) -> (..., 4)."""
+    R = np.asarray(R, dtype=np.float64)
+    m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    # Four times the square of each component; dividing by the largest keeps full precision everywhere.
+    squares = np.stack([1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22, 1 + m00 + m11 + m22], axis=-1)
+    d21, d02, d10 = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
+    s01, s02, s12 = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
+    rows = np.stack(
+        [
+            np.stack([squares[..., 0], s01, s02, d21], axis=-1),
+            np.stack([s01, squares[..., 1], s12, d02], axis=-1),
+            np.stack([s02, s12, squares[..., 2], d10], axis=-1),
+            np.stack([d21, d02, d10, squares[..., 3]], axis=-1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(squares, axis=-1)
+    q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., 3:] < 0, -q, q)
+
+
+def matrix_from_quat(quat_xyzw: Array) -> Array:
+    """Rotation matrix of a quaternion, normalised here: (..., 4) -> (..., 3, 3)."""
+    q = np.asarray(quat_xyzw, dtype=np.float64)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=-1),
+            np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=-1),
+            np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=-1),
+        ],
+        axis=-2,
+    )
+
+
+def transform(R: Array, t: Array) -> Array:
+    """Rigid transform from its parts: (..., 3, 3), (..., 3) -> (..., 4, 4)."""
+    R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
+    T = np.zeros(R.shape[:-2] + (4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
+    return T
+
+
+def inverse(T: Array) -> Array:
+    """Inverse of a rigid transform: (..., 4, 4) -> (..., 4, 4)."""
+    R_t = np.swapaxes(T[..., :3, :3], -1, -2)
+    return transform(R_t, -(R_t @ T[..., :3, 3:])[..., 0])
+
+
+def row_from_matrix(T: Array) -> Array:
+    """Pose row ``[x y z qx qy qz qw]``, qw >= 0: (..., 4, 4) -> (..., 7)."""
+    T = np.asarray(T, dtype=np.float64)
+    return np.concatenate([T[..., :3, 3], quat_from_matrix(T[..., :3, :3])], axis=-1)
+
+
+def matrix_from_row(row: Array) -> Array:
+    """Rigid transform of a pose row; NaN rows give NaN matrices: (..., 7) -> (..., 4, 4)."""
+    row = np.asarray(row, dtype=np.float64)
+    return transform(matrix_from_quat(row[..., 3:]), row[..., :3])
+
+
+def is_rigid(T: Array, tolerance: float = 1e-4) -> NDArray[np.bool_]:
+    """Whether each matrix is finite, has a proper rotation and the last row 0 0 0 1: (..., 4, 4) -> (...) bool."""
+    T = np.asarray(T, dtype=np.float64)
+    finite = np.isfinite(T).all(axis=(-1, -2))
+    safe = np.where(finite[..., None, None], T, np.eye(4))
+    R = safe[..., :3, :3]
+    orthogonal = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(-1, -2)) < tolerance
+    last = np.abs(safe[..., 3, :] - np.array([0.0, 0.0, 0.0, 1.0])).max(axis=-1) < tolerance
+    return finite & orthogonal & last & (np.linalg.det(R) > 0)

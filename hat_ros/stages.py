@@ -1,0 +1,95 @@
+"""The seams of the method: what a backend must offer, and the name -> backend map.
+
+A backend is a class in a file of its own. It is imported only when its name is asked for, so that nobody pays for
+torch to run the default preset. To add one: write the class, add one line to :data:`BACKENDS`.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Protocol
+
+from hat_ros.config import HatConfig
+from hat_ros.errors import ConfigError, MissingDependencyError
+from hat_ros.target import Target
+from hat_ros.types import Candidates, Detection, Frame, Motion, PosePrior
+
+
+class Segmenter(Protocol):
+    """Stage 1. Constructed as ``Backend(config: HatConfig, target: Target)``."""
+
+    def update(self, frame: Frame, prior: PosePrior | None) -> Detection | None:
+        """Find the target; None rather than a wrong mask."""
+        ...
+
+    def reset(self) -> None:
+        """Forget everything learned from earlier frames."""
+        ...
+
+
+class HypothesisBackend(Protocol):
+    """Stage 2's estimator. Constructed as ``Backend(config: HatConfig, target: Target)``."""
+
+    def generate(self, frame: Frame, detection: Detection, prior: PosePrior | None) -> Candidates:
+        """Up to K scored poses for one image, best first; zero rows when nothing fits."""
+        ...
+
+    def reset(self) -> None:
+        """Forget everything learned from earlier frames."""
+        ...
+
+
+class MotionEstimator(Protocol):
+    """Target-relative SLAM. Constructed as ``Backend(config: HatConfig, target: Target)``."""
+
+    def update(self, frame: Frame, detection: Detection | None, prior: PosePrior | None) -> Motion:
+        """Advance by one frame; ``Motion.none(epoch)`` rather than a guess."""
+        ...
+
+    def reset(self) -> None:
+        """Start a new epoch."""
+        ...
+
+
+BACKENDS: dict[str, dict[str, str]] = {
+    "segmentation": {
+        "classical": "hat_ros.segmentation.classical:ClassicalSegmenter",
+        "annotated": "hat_ros.segmentation.annotated:AnnotatedSegmenter",
+        "mask2former": "hat_ros.segmentation.mask2former:Mask2FormerSegmenter",
+    },
+    "hypotheses": {
+        "template": "hat_ros.hypotheses.template:TemplateHypotheses",
+        "megapose": "hat_ros.hypotheses.megapose:MegaPoseHypotheses",
+        "picopose": "hat_ros.hypotheses.picopose:PicoPoseHypotheses",
+        "gigapose": "hat_ros.hypotheses.gigapose:GigaPoseHypotheses",
+    },
+    "slam": {
+        "feature": "hat_ros.slam.feature:FeatureSlam",
+        "droid": "hat_ros.slam.droid:DroidSlam",
+    },
+}
+
+
+def create_backend(stage: str, config: HatConfig, target: Target) -> Segmenter | HypothesisBackend | MotionEstimator:
+    """Build the backend that ``config.<stage>.backend`` names.
+
+    Raises:
+        ConfigError: the name is unknown.
+        MissingDependencyError: the backend needs a package that is not installed.
+    """
+    name = getattr(config, stage).backend
+    try:
+        module_name, class_name = BACKENDS[stage][name].split(":")
+    except KeyError:
+        known = ", ".join(sorted(BACKENDS[stage]))
+        raise ConfigError(f"{stage}.backend: unknown backend '{name}', known are {known}") from None
+    try:
+        module = import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name and error.name.split(".")[0] == "hat_ros":
+            raise
+        raise MissingDependencyError(
+            f"{stage}.backend '{name}' needs the package '{error.name}', which is not installed: "
+            f"run `make install-nets` (or `pip install 'hat_ros[nets]'`)"
+        ) from None
+    return getattr(module, class_name)(config, target)
