@@ -1,0 +1,417 @@
+"""The target's CAD model: metric triangles, their colours, and nothing that depends on a file format.
+
+The coordinates are the file's own, with the transforms of its scene graph applied and no change of axes: a glTF stays
+y-up if it was modelled so. Poses ``T_cam_target`` refer to exactly this frame. Mesh files come from others, so they are
+checked before a parser allocates anything from what they declare (DESIGN section 7).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import struct
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+import yaml
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.distance import cdist
+
+from hat_ros.errors import MeshError
+
+MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb")
+MAX_FILE_BYTES = 256 * 2**20
+MAX_FACES = 4_000_000
+MAX_VERTICES = 8_000_000
+MAX_NODES = 20_000
+MAX_TEXTURE_SIDE_PX = 2048
+MAX_SOURCE_TEXTURE_PX = 64 * 2**20
+EXTENT_RANGE_M = (1e-3, 1e3)
+
+_GREY = 160
+# Barycentric sample points for the mean colour of a face: centroids of a regular 4 x 4 subdivision.
+_FACE_SAMPLES = np.array(
+    [((3 * i + 1) / 12, (3 * j + 1) / 12, (10 - 3 * i - 3 * j) / 12) for i in range(4) for j in range(4 - i)]
+    + [((3 * i + 2) / 12, (3 * j + 2) / 12, (8 - 3 * i - 3 * j) / 12) for i in range(3) for j in range(3 - i)]
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """How the faces look: textures with per-corner coordinates, and gloss; kept apart from the geometry.
+
+    Attributes:
+        corner_uv: (F, 3, 2) float32 texture coordinates of the corners, glTF sense (v up), zero without texture.
+        corner_rgb: (F, 3, 3) uint8 vertex colours (sRGB), or None when no part has any.
+        texture_id: (F,) int16 index into ``textures``, -1 = the face's own colour.
+        textures: (h, w, 3) uint8 images, sRGB, colour factors already applied.
+        roughness: (F,) float32, 0 mirror to 1 matt.
+        metallic: (F,) float32, 0 dielectric to 1 metal.
+    """
+
+    corner_uv: NDArray[np.float32]
+    corner_rgb: NDArray[np.uint8] | None
+    texture_id: NDArray[np.int16]
+    textures: tuple[NDArray[np.uint8], ...]
+    roughness: NDArray[np.float32]
+    metallic: NDArray[np.float32]
+
+    def sample(
+        self, face_id: NDArray[np.int32], barycentric: NDArray[np.floating], face_rgb: NDArray[np.uint8]
+    ) -> NDArray[np.uint8]:
+        """Albedo (N, 3) uint8 sRGB at points on faces: (N,) face, (N, 3) barycentric weights of its corners."""
+        rgb = face_rgb[face_id]
+        weights = np.asarray(barycentric, dtype=np.float32)
+        if self.corner_rgb is not None:
+            rgb = np.rint(np.einsum("nk,nkc->nc", weights, self.corner_rgb[face_id].astype(np.float32))).astype(
+                np.uint8
+            )
+        texture_id = self.texture_id[face_id]
+        for index, texture in enumerate(self.textures):
+            pick = np.flatnonzero(texture_id == index)
+            if not pick.size:
+                continue
+            uv = np.einsum("nk,nkc->nc", weights[pick], self.corner_uv[face_id[pick]])
+            height, width = texture.shape[:2]
+            u = np.floor((uv[:, 0] % 1.0) * width).astype(np.int64) % width
+            v = np.floor(((1.0 - uv[:, 1]) % 1.0) * height).astype(np.int64) % height
+            rgb[pick] = texture[v, u]
+        return rgb
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A metric CAD model.
+
+    Attributes:
+        name: stem of the file, for people.
+        vertices_m: (V, 3) float64, coincident vertices merged, all of them used.
+        faces: (F, 3) int32, none of zero area.
+        face_rgb: (F, 3) uint8 mean sRGB colour of each face, grey (160) when the file has no colours.
+        surface: textures and gloss, for rendering.
+        sha256: hexadecimal digest of geometry and colours as loaded (unit scale included), the key of caches.
+    """
+
+    name: str
+    vertices_m: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    face_rgb: NDArray[np.uint8]
+    surface: Surface
+    sha256: str
+
+    @cached_property
+    def center_m(self) -> NDArray[np.float64]:
+        """(3,) centre of the axis-aligned box."""
+        return 0.5 * (self.vertices_m.min(axis=0) + self.vertices_m.max(axis=0))
+
+    @cached_property
+    def bounding_radius_m(self) -> float:
+        """Radius of the sphere about :attr:`center_m` that holds the model."""
+        return float(np.linalg.norm(self.vertices_m - self.center_m, axis=1).max())
+
+    @cached_property
+    def diameter_m(self) -> float:
+        """Largest distance between two vertices."""
+        points = self.vertices_m
+        with contextlib.suppress(QhullError):  # a flat model has no hull of its own
+            points = points[ConvexHull(points).vertices]
+        return max(float(cdist(points[i : i + 512], points).max()) for i in range(0, len(points), 512))
+
+    @cached_property
+    def mesh(self) -> trimesh.Trimesh:
+        """The geometry as a ``trimesh`` object with face colours, in the same vertex and face order."""
+        return trimesh.Trimesh(self.vertices_m, self.faces, face_colors=self.face_rgb, process=False)
+
+
+def load_target(path: str | Path, unit_scale: float = 1.0) -> Target:
+    """Read a CAD model (obj, ply, stl, glb) or a ``target.yaml`` that names one.
+
+    ``target.yaml`` holds ``mesh`` (file beside it), ``unit_scale`` (metres per file unit) and ``name``.
+
+    Args:
+        path: the file.
+        unit_scale: metres per unit of the file; multiplies the one of a ``target.yaml``.
+
+    Raises:
+        MeshError: unreadable, other format, empty, not finite, or of absurd size or extent.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MeshError(f"CAD model {path}: no such file")
+    if path.suffix.lower() in (".yaml", ".yml"):
+        path, scale, name = _read_target_yaml(path)
+        return target_from_scene(_load_scene(path), name, unit_scale * scale)
+    return target_from_scene(_load_scene(path), path.stem, unit_scale)
+
+
+def target_from_scene(scene: trimesh.Scene, name: str, unit_scale: float = 1.0) -> Target:
+    """A target from a ``trimesh`` scene, its transforms applied.
+
+    Raises:
+        MeshError: no triangles, NaN, or absurd extents.
+    """
+    if not (np.isfinite(unit_scale) and unit_scale > 0):
+        raise MeshError(f"CAD model {name}: unit_scale must be a positive number, found {unit_scale}")
+    parts = [_part(scene, node, name) for node in sorted(scene.graph.nodes_geometry)]
+    parts = [part for part in parts if part is not None]
+    if not parts:
+        raise MeshError(f"CAD model {name}: it holds no triangles; export the surface as a triangle mesh")
+    corners = np.concatenate([part.corners_m for part in parts]) * unit_scale
+    _check_extent(corners, name, unit_scale)
+    # Exporters split vertices at texture seams, with rounding noise: merge what a millionth of the extent separates.
+    origin, extent = corners.min(axis=(0, 1)), np.ptp(corners.reshape(-1, 3), axis=0).max()
+    grid = np.rint((corners - origin) / (1e-6 * extent))
+    keep = _face_areas(grid) > 0
+    if not keep.any():
+        raise MeshError(f"CAD model {name}: every triangle has zero area")
+    _, first, index = np.unique(grid[keep].reshape(-1, 3), axis=0, return_index=True, return_inverse=True)
+    vertices = corners[keep].reshape(-1, 3)[first]
+    faces = index.reshape(-1, 3).astype(np.int32)
+    surface, face_rgb = _surface(parts, keep)
+    digest = hashlib.sha256()
+    for array in (vertices, faces, face_rgb):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    for array in (vertices, faces, face_rgb):
+        array.setflags(write=False)
+    return Target(name, vertices, faces, face_rgb, surface, digest.hexdigest())
+
+
+@dataclass(frozen=True)
+class _Part:
+    corners_m: NDArray[np.float64]  # (F, 3, 3)
+    corner_uv: NDArray[np.float32]  # (F, 3, 2)
+    corner_rgb: NDArray[np.uint8] | None  # (F, 3, 3)
+    rgb: NDArray[np.uint8]  # (F, 3)
+    texture: NDArray[np.uint8] | None
+    roughness: float
+    metallic: float
+
+
+def _part(scene: trimesh.Scene, node: str, name: str) -> _Part | None:
+    T, geometry_name = scene.graph[node]
+    mesh = scene.geometry[geometry_name]
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        return None
+    faces = np.asarray(mesh.faces)
+    if faces.min() < 0 or faces.max() >= len(mesh.vertices):
+        raise MeshError(f"CAD model {name}: part '{geometry_name}' has faces that refer to missing vertices")
+    vertices = np.asarray(mesh.vertices, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
+    n_faces = len(faces)
+    corner_uv = np.zeros((n_faces, 3, 2), np.float32)
+    corner_rgb, texture, rgb = None, None, np.full((n_faces, 3), _GREY, np.uint8)
+    roughness, metallic = 0.6, 0.0
+    visual = mesh.visual
+    if visual.kind == "texture":
+        rgb[:], texture, roughness, metallic = _material(visual.material)
+        uv = None if visual.uv is None else np.asarray(visual.uv, dtype=np.float32)
+        if uv is None or len(uv) != len(mesh.vertices) or not np.isfinite(uv).all():
+            texture = None
+        elif texture is not None:
+            corner_uv = uv[faces]
+    elif visual.kind == "vertex":
+        corner_rgb = np.asarray(visual.vertex_colors, dtype=np.uint8)[:, :3][faces]
+    elif visual.kind == "face":
+        rgb = np.asarray(visual.face_colors, dtype=np.uint8)[:, :3].copy()
+    return _Part(vertices[faces], corner_uv, corner_rgb, rgb, texture, roughness, metallic)
+
+
+def _material(material: Any) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None, float, float]:
+    """Colour (3,) sRGB, texture or None, roughness and metallic of a trimesh material."""
+    is_pbr = isinstance(material, trimesh.visual.material.PBRMaterial)
+    if is_pbr:
+        factor, image = material.baseColorFactor, material.baseColorTexture
+        roughness = 0.6 if material.roughnessFactor is None else float(np.clip(material.roughnessFactor, 0.05, 1))
+        metallic = 0.0 if material.metallicFactor is None else float(np.clip(material.metallicFactor, 0, 1))
+    else:
+        factor, image = getattr(material, "diffuse", None), getattr(material, "image", None)
+        roughness, metallic = 0.6, 0.0
+    factor = np.full(3, 255.0) if factor is None else np.asarray(factor, dtype=np.float64).reshape(-1)[:3]
+    # glTF factors are linear, its textures and everything of OBJ are sRGB.
+    color = srgb_from_linear(factor / 255.0) if is_pbr else np.rint(factor).astype(np.uint8)
+    if image is None:
+        return color, None, roughness, metallic
+    image = image.convert("RGB")
+    if max(image.size) > MAX_TEXTURE_SIDE_PX:
+        image.thumbnail((MAX_TEXTURE_SIDE_PX, MAX_TEXTURE_SIDE_PX))
+    texture = np.array(image, dtype=np.uint8)
+    if is_pbr and factor.min() < 254.5:
+        texture = srgb_from_linear(linear_from_srgb(texture) * (factor / 255.0))
+    return color, texture, roughness, metallic
+
+
+def _surface(parts: list[_Part], keep: NDArray[np.bool_]) -> tuple[Surface, NDArray[np.uint8]]:
+    counts = [len(part.rgb) for part in parts]
+    textures: list[NDArray[np.uint8]] = []
+    texture_id = []
+    for part, count in zip(parts, counts, strict=True):
+        index = -1
+        if part.texture is not None:
+            index = next((i for i, other in enumerate(textures) if other is part.texture), len(textures))
+            if index == len(textures):
+                textures.append(part.texture)
+        texture_id.append(np.full(count, index, np.int16))
+    corner_rgb = None
+    if any(part.corner_rgb is not None for part in parts):
+        corner_rgb = np.concatenate(
+            [np.repeat(p.rgb[:, None], 3, axis=1) if p.corner_rgb is None else p.corner_rgb for p in parts]
+        )[keep]
+    surface = Surface(
+        np.concatenate([part.corner_uv for part in parts])[keep],
+        corner_rgb,
+        np.concatenate(texture_id)[keep],
+        tuple(textures),
+        np.repeat([part.roughness for part in parts], counts).astype(np.float32)[keep],
+        np.repeat([part.metallic for part in parts], counts).astype(np.float32)[keep],
+    )
+    rgb = np.concatenate([part.rgb for part in parts])[keep]
+    every = np.arange(len(rgb), dtype=np.int32)
+    mean = np.zeros((len(rgb), 3), np.float64)
+    for weights in _FACE_SAMPLES:
+        mean += surface.sample(every, np.broadcast_to(weights, (len(rgb), 3)), rgb)
+    return surface, np.rint(mean / len(_FACE_SAMPLES)).astype(np.uint8)
+
+
+def linear_from_srgb(rgb: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Linear light 0..1 of 8-bit sRGB values (IEC 61966-2-1)."""
+    c = np.asarray(rgb, dtype=np.float64) / 255.0
+    return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+
+
+def srgb_from_linear(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """8-bit sRGB values of linear light, clipped to 0..1 (IEC 61966-2-1)."""
+    c = np.clip(np.asarray(linear, dtype=np.float64), 0.0, 1.0)
+    return np.rint(255.0 * np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)).astype(np.uint8)
+
+
+def _face_areas(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+
+
+def _check_extent(corners: NDArray[np.float64], name: str, unit_scale: float) -> None:
+    if not np.isfinite(corners).all():
+        raise MeshError(f"CAD model {name}: some vertex coordinates are not finite numbers; repair the file")
+    extent = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
+    low, high = EXTENT_RANGE_M
+    if not low <= extent <= high:
+        raise MeshError(
+            f"CAD model {name}: its largest extent is {extent:.3g} m with unit_scale {unit_scale:g}, expected "
+            f"{low:g} to {high:g} m; set unit_scale to the metres per unit of the file (0.001 for millimetres)"
+        )
+
+
+def _read_target_yaml(path: Path) -> tuple[Path, float, str]:
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise MeshError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
+    if not isinstance(data, dict) or not isinstance(data.get("mesh"), str):
+        raise MeshError(f"{path}: expected a mapping with the key 'mesh' naming a file beside it")
+    unknown = sorted(set(data) - {"mesh", "unit_scale", "name"})
+    if unknown:
+        raise MeshError(f"{path}: unknown key '{unknown[0]}', known keys are mesh, unit_scale, name")
+    scale = data.get("unit_scale", 1.0)
+    if isinstance(scale, bool) or not isinstance(scale, (int, float)):
+        raise MeshError(f"{path}: unit_scale must be a number, found {scale!r}")
+    mesh = (path.parent / data["mesh"]).resolve()
+    if path.parent.resolve() not in mesh.parents:
+        raise MeshError(f"{path}: mesh '{data['mesh']}' must lie in the same folder")
+    if mesh.suffix.lower() not in MESH_SUFFIXES:
+        raise MeshError(f"{path}: mesh '{data['mesh']}' must be one of {', '.join(MESH_SUFFIXES)}")
+    return mesh, float(scale), str(data.get("name", mesh.stem))
+
+
+def _load_scene(path: Path) -> trimesh.Scene:
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        raise MeshError(f"CAD model {path.name}: format '{suffix}' is not supported, give {', '.join(MESH_SUFFIXES)}")
+    if not path.is_file():
+        raise MeshError(f"CAD model {path}: no such file")
+    size = path.stat().st_size
+    if not 0 < size <= MAX_FILE_BYTES:
+        raise MeshError(f"CAD model {path.name}: the file has {size} bytes, expected 1 to {MAX_FILE_BYTES}")
+    {".glb": _check_glb, ".ply": _check_ply, ".stl": _check_text_or_size, ".obj": _check_text_or_size}[suffix](path)
+    try:
+        scene = trimesh.load_scene(path, file_type=suffix[1:], process=False)
+    except Exception as error:  # parsers raise whatever the broken bytes lead them to
+        raise MeshError(
+            f"CAD model {path.name}: not a readable {suffix[1:]} file ({type(error).__name__}: {_short(error)})"
+        ) from None
+    _check_scene(scene, path.name)
+    return scene
+
+
+def _short(error: Exception) -> str:
+    return " ".join(str(error).split())[:160]
+
+
+def _check_scene(scene: trimesh.Scene, name: str) -> None:
+    """Count what the scene graph would expand to before expanding it: instances multiply."""
+    nodes = scene.graph.nodes_geometry
+    if len(nodes) > MAX_NODES:
+        raise MeshError(f"CAD model {name}: {len(nodes)} placed parts, at most {MAX_NODES} are accepted")
+    meshes = [scene.geometry[scene.graph[node][1]] for node in nodes]
+    meshes = [mesh for mesh in meshes if isinstance(mesh, trimesh.Trimesh)]
+    n_faces = sum(len(mesh.faces) for mesh in meshes)
+    if n_faces > MAX_FACES:
+        raise MeshError(f"CAD model {name}: {n_faces} triangles, at most {MAX_FACES} are accepted; simplify it")
+
+
+def _check_text_or_size(path: Path) -> None:
+    """OBJ and STL declare little: refuse archives in disguise and a binary STL longer than its file."""
+    with path.open("rb") as file:
+        head = file.read(84)
+    if head[:4] in (b"PK\x03\x04", b"\x1f\x8b\x08\x00", b"7z\xbc\xaf") or head[:2] == b"\x1f\x8b":
+        raise MeshError(f"CAD model {path.name}: it is an archive, not a {path.suffix[1:]} file; unpack it first")
+    if path.suffix.lower() == ".stl" and not head.lstrip().lower().startswith(b"solid") and len(head) == 84:
+        declared = struct.unpack("<I", head[80:])[0]
+        if 84 + 50 * declared != path.stat().st_size:
+            raise MeshError(f"CAD model {path.name}: the STL header says {declared} triangles, the file's size differs")
+
+
+def _check_ply(path: Path) -> None:
+    with path.open("rb") as file:
+        head = file.read(65536)
+    if not head.startswith(b"ply") or b"end_header" not in head:
+        raise MeshError(f"CAD model {path.name}: it does not start with a PLY header")
+    for line in head.split(b"end_header")[0].splitlines():
+        words = line.split()
+        if len(words) == 3 and words[0] == b"element":
+            count = int(words[2]) if words[2].isdigit() else -1
+            # The smallest element that carries anything takes a byte.
+            if not 0 <= count <= path.stat().st_size:
+                raise MeshError(
+                    f"CAD model {path.name}: the PLY header declares {words[2].decode('ascii', 'replace')} "
+                    f"'{words[1].decode('ascii', 'replace')}' elements, more than the file can hold"
+                )
+
+
+def _check_glb(path: Path) -> None:
+    """What the JSON chunk declares must fit the file: sparse accessors and shared nodes can declare gigabytes."""
+    with path.open("rb") as file:
+        head = file.read(20)
+        if len(head) < 20 or head[:4] != b"glTF" or head[16:20] != b"JSON":
+            raise MeshError(f"CAD model {path.name}: it is not a binary glTF 2.0 (GLB) file")
+        version, _, json_bytes = struct.unpack("<III", head[4:16])
+        if version != 2 or json_bytes > path.stat().st_size:
+            raise MeshError(f"CAD model {path.name}: GLB version {version} or a truncated header; export as glTF 2.0")
+        try:
+            tree = json.loads(file.read(json_bytes))
+        except (ValueError, RecursionError):
+            raise MeshError(f"CAD model {path.name}: its GLB header is not valid JSON") from None
+    if not isinstance(tree, dict):
+        raise MeshError(f"CAD model {path.name}: its GLB header is not a mapping")
+    try:
+        declared = sum(int(accessor["count"]) for accessor in tree.get("accessors", []))
+        children = [child for node in tree.get("nodes", []) for child in node.get("children", [])]
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise MeshError(f"CAD model {path.name}: its GLB header is malformed") from None
+    if declared > MAX_VERTICES * 4:
+        raise MeshError(f"CAD model {path.name}: its header declares {declared} values, more than is accepted")
+    if len(children) != len(set(map(str, children))) or len(tree.get("nodes", [])) > MAX_NODES:
+        raise MeshError(f"CAD model {path.name}: its scene graph is not a tree of at most {MAX_NODES} nodes")
