@@ -1,0 +1,115 @@
+"""Ray casting on the CPU with Intel Embree (the ``embreex`` wheel): no GL, and the same bytes every time.
+
+One ray through each pixel centre, with camera z = 1, so that the ray parameter of a hit is its depth. Only pixels
+within the projected bounds of the convex hull are cast.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from embreex import rtcore_scene
+from embreex.mesh_construction import TriangleMesh
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from hat_ros.render import Rendering
+from hat_ros.target import Target
+from hat_ros.types import Camera
+
+# Hits beyond this are Embree's "no hit" marker (1e37).
+_FAR = np.float32(1e30)
+
+
+class RayCaster:
+    """Nearest hits and visibility for bundles of rays against one target, in the target frame."""
+
+    def __init__(self, target: Target) -> None:
+        corners = np.ascontiguousarray(target.vertices_m[target.faces], dtype=np.float32)
+        self._scene = rtcore_scene.EmbreeScene()
+        TriangleMesh(self._scene, corners)
+
+    def cast(
+        self, origins_m: NDArray[np.floating], directions: NDArray[np.floating]
+    ) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
+        """Nearest hits: (N, 3), (N, 3) -> face (N,) or -1, ray parameter (N,), barycentric weights (N, 3)."""
+        hits = self._scene.run(
+            np.ascontiguousarray(origins_m, dtype=np.float32),
+            np.ascontiguousarray(directions, dtype=np.float32),
+            output=True,
+        )
+        face = hits["primID"]
+        face[hits["tfar"] > _FAR] = -1
+        u, v = hits["u"], hits["v"]
+        return face, hits["tfar"], np.stack([1.0 - u - v, u, v], axis=-1)
+
+    def occluded(self, origins_m: NDArray[np.floating], directions: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Whether anything lies on each ray: (N, 3), (N, 3) -> (N,)."""
+        hits = self._scene.run(
+            np.ascontiguousarray(origins_m, dtype=np.float32),
+            np.ascontiguousarray(directions, dtype=np.float32),
+            query="OCCLUDED",
+        )
+        return np.asarray(hits) != -1
+
+
+class EmbreeRenderer:
+    """See the module's text."""
+
+    def __init__(self, target: Target) -> None:
+        self._target = target
+        self.caster = RayCaster(target)
+        corners = target.vertices_m[target.faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        self._face_normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        try:
+            self._hull_m = target.vertices_m[ConvexHull(target.vertices_m).vertices]
+        except QhullError:  # a flat model
+            self._hull_m = target.vertices_m
+
+    def render(self, T_cam_target: NDArray[np.float64], camera: Camera, color: bool = True) -> Rendering:
+        """See :meth:`hat_ros.render.Renderer.render`."""
+        shape = (camera.height, camera.width)
+        depth = np.zeros(shape, np.float32)
+        normal = np.zeros((*shape, 3), np.float32)
+        face_id = np.full(shape, -1, np.int32)
+        rgb = np.zeros((*shape, 3), np.uint8)
+        x0, y0, x1, y1 = self._pixel_bounds(T_cam_target, camera)
+        if x0 >= x1 or y0 >= y1:
+            return Rendering(depth, normal, face_id, rgb)
+
+        directions_cam = pixel_rays(camera, np.arange(x0, x1), np.arange(y0, y1)).reshape(-1, 3)
+        R, t = T_cam_target[:3, :3], T_cam_target[:3, 3]
+        directions = directions_cam @ R  # rows times R = R^T applied to each
+        origins = np.broadcast_to(-t @ R, directions.shape)
+        face, z, barycentric = self.caster.cast(origins, directions)
+        hit = np.flatnonzero(face >= 0)
+        rows, cols = hit // (x1 - x0) + y0, hit % (x1 - x0) + x0
+        face = face[hit]
+        n = self._face_normals[face] @ R.T
+        n[np.einsum("nk,nk->n", n, directions_cam[hit]) > 0] *= -1.0
+        depth[rows, cols] = z[hit]
+        normal[rows, cols] = n
+        face_id[rows, cols] = face
+        if color:
+            rgb[rows, cols] = self._target.surface.sample(face, barycentric[hit], self._target.face_rgb)
+        return Rendering(depth, normal, face_id, rgb)
+
+    def _pixel_bounds(self, T_cam_target: NDArray[np.float64], camera: Camera) -> tuple[int, int, int, int]:
+        """Half-open pixel range that can see the target: x0, y0, x1, y1."""
+        points = self._hull_m @ T_cam_target[:3, :3].T + T_cam_target[:3, 3]
+        if points[:, 2].max() <= 0:
+            return 0, 0, 0, 0
+        if points[:, 2].min() <= 1e-6:  # the camera is beside or inside: no finite bounds
+            return 0, 0, camera.width, camera.height
+        uv = camera.project(points)
+        size = np.array([camera.width, camera.height])
+        low = np.clip(np.floor(uv.min(axis=0)), 0, size).astype(int)
+        high = np.clip(np.ceil(uv.max(axis=0)) + 1, 0, size).astype(int)
+        return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+
+def pixel_rays(camera: Camera, u_px: NDArray[np.floating], v_px: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Ray directions with z = 1 through a grid of image points: (U,), (V,) px -> (V, U, 3), camera frame."""
+    y = (np.asarray(v_px, dtype=np.float64) - camera.K[1, 2]) / camera.K[1, 1]
+    x = (np.asarray(u_px, dtype=np.float64)[None] - camera.K[0, 2] - camera.K[0, 1] * y[:, None]) / camera.K[0, 0]
+    return np.stack([x, np.broadcast_to(y[:, None], x.shape), np.ones_like(x)], axis=-1)
