@@ -1,0 +1,439 @@
+"""Public network weights: where they come from, where they go, and how they are read safely.
+
+Nothing is ever downloaded. A checkpoint is looked for in one folder, ``--weights``, else ``$HAT_WEIGHTS``, else
+``$XDG_DATA_HOME/hat_ros/weights``. A pickled file is opened only after its SHA-256 agrees with the published one, and
+then with ``weights_only=True``; safetensors hold no code, so for them names and shapes are the whole check.
+:func:`convert` turns a pickled file into safetensors once, reading it without running anything that it names.
+
+This module imports torch and safetensors only inside the functions that read tensors, so that listing and checking
+work without them.
+"""
+
+from __future__ import annotations
+
+import collections
+import hashlib
+import os
+import pickle
+import types
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hat_ros.errors import MissingDependencyError, WeightsError
+
+if TYPE_CHECKING:
+    import torch
+
+_NO_CHECKSUM = "none published"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """One public checkpoint.
+
+    Attributes:
+        name: what our commands and error messages call it.
+        filename: path below the weights folder under which the public file is expected.
+        source: where a person finds it.
+        licence: licence of the code and, where it differs, of the weights.
+        sha256: published checksum, lower case; empty when none is published.
+        size: size as far as it is known, for people.
+        container: key of the state dict inside the file; empty when the file is the state dict.
+        renames: (old prefix, new prefix) applied to every tensor name, the first that fits.
+        cut_rows: tensors stored with more rows (first axis) than the network uses -> rows to keep.
+        companions: (filename, sha256) of small files that belong beside it.
+        library_folder: a folder in the layout of the `transformers` library instead of one file.
+    """
+
+    name: str
+    filename: str
+    source: str
+    licence: str
+    sha256: str = ""
+    size: str = "unknown"
+    container: str = ""
+    renames: tuple[tuple[str, str], ...] = ()
+    cut_rows: tuple[tuple[str, int], ...] = ()
+    companions: tuple[tuple[str, str], ...] = ()
+    library_folder: bool = False
+
+    @property
+    def converted_filename(self) -> str:
+        """Name of the safetensors file that :func:`convert` writes."""
+        return f"{self.name}.safetensors"
+
+
+_MEGAPOSE_RENAMES = (("backbone.backbone.", "backbone."), ("backbone.head.0.", "views_logits_head."))
+_MEGAPOSE_SOURCE = "https://www.paris.inria.fr/archive_ylabbeprojectsdata/megapose/megapose-models/"
+
+CHECKPOINTS: dict[str, Checkpoint] = {
+    item.name: item
+    for item in (
+        Checkpoint(
+            name="droid",
+            filename="droid.pth",
+            source="https://github.com/princeton-vl/DROID-SLAM (README, 'droid.pth')",
+            licence="BSD-3-Clause code; the weights carry no licence of their own",
+            sha256="46476ef64cde45a97504910d6f3de2eef7b398ec1c6e4e668815c29076024526",
+            size="about 16 MB",
+            renames=(("module.", ""),),
+            cut_rows=(
+                ("update.weight.2.weight", 2),
+                ("update.weight.2.bias", 2),
+                ("update.delta.2.weight", 2),
+                ("update.delta.2.bias", 2),
+            ),
+        ),
+        Checkpoint(
+            name="megapose_coarse",
+            filename="coarse-rgb-906902141/checkpoint.pth.tar",
+            source=_MEGAPOSE_SOURCE + "coarse-rgb-906902141/",
+            licence="Apache-2.0",
+            sha256="30fa2ba97d1bb1b27f6443b6671f557baebf3dff93fcc8605a6c7924ead759a4",
+            size="about 83 MB",
+            container="state_dict",
+            renames=_MEGAPOSE_RENAMES,
+            companions=(
+                (
+                    "coarse-rgb-906902141/config.yaml",
+                    "24de955519e9d65c82a237b29844576989504e956448ecae07b0e2f2b6675bd9",
+                ),
+            ),
+        ),
+        Checkpoint(
+            name="megapose_refiner",
+            filename="refiner-rgb-653307694/checkpoint.pth.tar",
+            source=_MEGAPOSE_SOURCE + "refiner-rgb-653307694/",
+            licence="Apache-2.0",
+            sha256="52dd473fc719488e2f45a98aac2f83960ebe1534b2845cb292c0a287ba70adb7",
+            size="about 83 MB",
+            container="state_dict",
+            renames=_MEGAPOSE_RENAMES,
+            companions=(
+                (
+                    "refiner-rgb-653307694/config.yaml",
+                    "29e02244d9b674fd5e374c9902b567cfe5ef4e2e2e3fef01dd1d6188df7b7d84",
+                ),
+            ),
+        ),
+        Checkpoint(
+            name="picopose",
+            filename="picopose.ckpt",
+            source="https://github.com/foollh/PicoPose (README, trained model)",
+            licence="MIT badge without a licence file; includes fine-tuned DINOv2 (Apache-2.0)",
+            sha256="9d1173d3db55e690e468edde453b06d47402d7b993748e4d2fe8f34a203014c0",
+            size="about 1.5 GB",
+            container="state_dict",
+            renames=(("network.", ""),),
+        ),
+        Checkpoint(
+            name="gigapose",
+            filename="gigaPose_v1.ckpt",
+            source="https://huggingface.co/datasets/nv-nguyen/gigaPose (gigaPose_v1.ckpt)",
+            licence="MIT",
+            size="about 3.6 GB",
+            container="state_dict",
+        ),
+        Checkpoint(
+            name="mask2former",
+            filename="mask2former-swin-large-coco-instance",
+            source="https://huggingface.co/facebook/mask2former-swin-large-coco-instance",
+            licence="MIT code; weights CC BY-NC 4.0 (non-commercial)",
+            size="about 866 MB",
+            library_folder=True,
+        ),
+    )
+}
+
+
+@dataclass(frozen=True)
+class WeightsStatus:
+    """What :func:`check` found for one checkpoint.
+
+    Attributes:
+        checkpoint: the entry asked about.
+        path: the file that a network would load, None when there is none.
+        usable: a network can load it as it is.
+        message: one sentence for people: what was found, and what to do if it is not usable.
+    """
+
+    checkpoint: Checkpoint
+    path: Path | None
+    usable: bool
+    message: str
+
+
+def weights_folder(folder: str | Path | None = None) -> Path:
+    """Folder of the checkpoints: the argument, else ``$HAT_WEIGHTS``, else the user's data folder."""
+    chosen = folder or os.environ.get("HAT_WEIGHTS")
+    if chosen:
+        return Path(chosen).expanduser()
+    data = os.environ.get("XDG_DATA_HOME") or "~/.local/share"
+    return Path(data).expanduser() / "hat_ros" / "weights"
+
+
+def checkpoint_named(name: str) -> Checkpoint:
+    """The registry's entry.
+
+    Raises:
+        WeightsError: there is no such entry.
+    """
+    try:
+        return CHECKPOINTS[name]
+    except KeyError:
+        raise WeightsError(f"no checkpoint is called '{name}', known are {', '.join(CHECKPOINTS)}") from None
+
+
+def find(name: str, folder: str | Path | None = None) -> Path:
+    """Path of the checkpoint on this machine, the safetensors file first.
+
+    Raises:
+        WeightsError: it is not there; the message names file, source, checksum and folder.
+    """
+    entry = checkpoint_named(name)
+    root = weights_folder(folder)
+    if entry.library_folder:
+        found = [root / entry.filename] if (root / entry.filename / "config.json").is_file() else []
+    else:
+        found = [path for path in (root / entry.converted_filename, root / entry.filename) if path.is_file()]
+    if found:
+        return found[0]
+    raise WeightsError(
+        f"{name}: neither {entry.filename} nor {entry.converted_filename} is in {root}; get {entry.filename} from "
+        f"{entry.source} (SHA-256 {entry.sha256 or _NO_CHECKSUM}, licence: {entry.licence}) and put it there, or "
+        f"point --weights or HAT_WEIGHTS at the folder that holds it"
+    )
+
+
+def sha256_of(path: Path) -> str:
+    """Hexadecimal SHA-256 of a file, read in blocks."""
+    digest = hashlib.sha256()
+    with path.open("rb") as stream:
+        while block := stream.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def check(name: str, folder: str | Path | None = None) -> WeightsStatus:
+    """Whether a checkpoint is present and unaltered; reads bytes only, never tensors."""
+    entry = checkpoint_named(name)
+    try:
+        path = find(name, folder)
+    except WeightsError as error:
+        return WeightsStatus(entry, None, False, str(error))
+    if entry.library_folder:
+        return WeightsStatus(entry, path, True, f"{path}: folder present")
+    if path.suffix == ".safetensors":
+        return WeightsStatus(entry, path, True, f"{path}: present, SHA-256 {sha256_of(path)}")
+    files = ((path, entry.sha256), *((path.parent / Path(file).name, digest) for file, digest in entry.companions))
+    for file, digest in files:
+        if not file.is_file():
+            return WeightsStatus(entry, path, False, f"{file} is missing: get it from {entry.source}")
+        try:
+            _verify(entry, file, digest)
+        except WeightsError as error:
+            return WeightsStatus(entry, path, False, str(error))
+    return WeightsStatus(entry, path, True, f"{path}: present, published checksum confirmed")
+
+
+def load_state(name: str, folder: str | Path | None = None) -> dict[str, torch.Tensor]:
+    """Tensors of a checkpoint on the CPU, under the names that our networks use.
+
+    Raises:
+        WeightsError: missing, altered, unreadable, or not a flat mapping of names to tensors.
+        MissingDependencyError: torch or safetensors is not installed.
+    """
+    entry = checkpoint_named(name)
+    path = find(name, folder)
+    if entry.library_folder:
+        raise WeightsError(f"{name}: {path} is a folder for the transformers library, not a state dict")
+    if path.suffix == ".safetensors":
+        return _read_safetensors(path)
+    _verify(entry, path, entry.sha256)
+    torch = _import("torch")
+    try:
+        data = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError:
+        raise WeightsError(
+            f"{path}: holds more than tensors, so it is not opened directly; run `hat weights convert {name}` once"
+        ) from None
+    except (RuntimeError, OSError, EOFError) as error:
+        raise WeightsError(f"{path}: is not a readable torch file ({_one_line(error)})") from None
+    return _normalised(entry, path, data)
+
+
+def load_into(module: torch.nn.Module, state: Mapping[str, torch.Tensor], name: str) -> None:
+    """Copy a state dict into a network, strictly: same names, same shapes, finite values.
+
+    Args:
+        module: the network.
+        state: tensor names -> tensors.
+        name: what the error messages call the checkpoint.
+
+    Raises:
+        WeightsError: names or shapes differ, or a value is not finite.
+    """
+    wanted = module.state_dict()
+    missing = [key for key in wanted if key not in state]
+    extra = [key for key in state if key not in wanted]
+    if missing or extra:
+        raise WeightsError(
+            f"{name}: the checkpoint does not fit the network: {len(missing)} tensors missing{_some(missing)}, "
+            f"{len(extra)} unknown{_some(extra)}; it must be the file named by `hat weights list`"
+        )
+    for key, tensor in state.items():
+        if tuple(tensor.shape) != tuple(wanted[key].shape):
+            raise WeightsError(
+                f"{name}: tensor '{key}' must have shape {tuple(wanted[key].shape)}, found {tuple(tensor.shape)}; "
+                f"it must be the file named by `hat weights list`"
+            )
+        if tensor.is_floating_point() and not tensor.isfinite().all():
+            raise WeightsError(f"{name}: tensor '{key}' holds values that are not finite; get the file again")
+    module.load_state_dict(dict(state), strict=True)
+
+
+def convert(name: str, source: str | Path | None = None, folder: str | Path | None = None) -> Path:
+    """Rewrite a pickled checkpoint as ``<name>.safetensors`` in the weights folder; returns the new path.
+
+    The pickle is read with a reader that knows tensors and plain containers only. Anything else that the file names
+    (training settings, library classes) becomes an inert placeholder: nothing of it is imported or called.
+
+    Args:
+        name: registry name.
+        source: the pickled file; default is its place in the weights folder.
+        folder: the weights folder.
+
+    Raises:
+        WeightsError: the file is missing, altered, or holds no state dict.
+        MissingDependencyError: torch or safetensors is not installed.
+    """
+    entry = checkpoint_named(name)
+    if entry.library_folder:
+        raise WeightsError(f"{name}: comes as a folder for the transformers library; there is nothing to convert")
+    root = weights_folder(folder)
+    path = Path(source).expanduser() if source else root / entry.filename
+    if not path.is_file():
+        raise WeightsError(f"{name}: {path} is not a file; get {entry.filename} from {entry.source}")
+    digest = _verify(entry, path, entry.sha256)
+    torch, safetensors = _import("torch"), _import("safetensors.torch")
+    try:
+        data = torch.load(path, map_location="cpu", weights_only=False, pickle_module=_inert_pickle())
+    except (pickle.UnpicklingError, RuntimeError, OSError, EOFError) as error:
+        raise WeightsError(f"{path}: is not a readable torch file ({_one_line(error)})") from None
+    state = {key: tensor.clone().contiguous() for key, tensor in _normalised(entry, path, data).items()}
+    root.mkdir(parents=True, exist_ok=True)
+    out = root / entry.converted_filename
+    partial = out.with_suffix(".partial")
+    safetensors.save_file(state, str(partial), metadata={"checkpoint": name, "source_sha256": digest})
+    partial.replace(out)
+    return out
+
+
+def _verify(entry: Checkpoint, path: Path, expected: str) -> str:
+    """SHA-256 of the file; raises when it differs from the published one."""
+    digest = sha256_of(path)
+    if expected and digest != expected:
+        raise WeightsError(
+            f"{entry.name}: {path} has SHA-256 {digest}, published is {expected}: the file is damaged or another "
+            f"version; get it again from {entry.source}"
+        )
+    return digest
+
+
+def _read_safetensors(path: Path) -> dict[str, torch.Tensor]:
+    safetensors, errors = _import("safetensors.torch"), _import("safetensors")
+    try:
+        return safetensors.load_file(str(path))
+    except (errors.SafetensorError, OSError) as error:
+        raise WeightsError(f"{path}: is not a readable safetensors file ({_one_line(error)})") from None
+
+
+def _normalised(entry: Checkpoint, path: Path, data: Any) -> dict[str, torch.Tensor]:
+    """State dict out of what the file held: container opened, prefixes renamed, unused rows cut."""
+    torch = _import("torch")
+    if entry.container:
+        data = data.get(entry.container) if isinstance(data, Mapping) else None
+    if not isinstance(data, Mapping) or not data or not all(isinstance(value, torch.Tensor) for value in data.values()):
+        where = f"under '{entry.container}'" if entry.container else "at its top level"
+        raise WeightsError(f"{entry.name}: {path} holds no mapping of names to tensors {where}; get the public file")
+    state = dict(_renamed(entry, data))
+    for key, rows in entry.cut_rows:
+        if key in state:
+            state[key] = state[key][:rows]
+    return state
+
+
+def _renamed(entry: Checkpoint, data: Mapping[str, torch.Tensor]) -> Iterator[tuple[str, torch.Tensor]]:
+    for key, tensor in data.items():
+        for old, new in entry.renames:
+            if key.startswith(old):
+                key = new + key[len(old) :]
+                break
+        yield key, tensor
+
+
+class _Placeholder:
+    """Stands for every object of a pickle that is neither a tensor nor a plain container."""
+
+    def __init__(self, *_args: Any, **_kwargs: Any) -> None:
+        pass
+
+    def __call__(self, *_args: Any, **_kwargs: Any) -> _Placeholder:
+        return self
+
+    def __setstate__(self, _state: Any) -> None:
+        pass
+
+    def __setitem__(self, _key: Any, _value: Any) -> None:
+        pass
+
+    def __hash__(self) -> int:
+        return 0
+
+    def append(self, _item: Any) -> None:
+        """Accept list items of an unknown list subclass."""
+
+    def extend(self, _items: Any) -> None:
+        """Accept list items of an unknown list subclass."""
+
+
+def _inert_pickle() -> types.ModuleType:
+    """A stand-in for :mod:`pickle` whose reader resolves tensors and plain containers, and nothing else."""
+    torch = _import("torch")
+    allowed: dict[tuple[str, str], Any] = {
+        ("collections", "OrderedDict"): collections.OrderedDict,
+        ("torch", "Size"): torch.Size,
+        ("torch", "device"): torch.device,
+        ("torch._utils", "_rebuild_tensor_v2"): torch._utils._rebuild_tensor_v2,
+        ("torch._utils", "_rebuild_parameter"): torch._utils._rebuild_parameter,
+    }
+
+    class Unpickler(pickle.Unpickler):
+        # torch answers for its storage types itself before it asks here.
+        def find_class(self, module: str, name: str) -> Any:
+            return allowed.get((module, name), _Placeholder)
+
+    stand_in = types.ModuleType("inert_pickle")
+    stand_in.Unpickler = Unpickler  # type: ignore[attr-defined]
+    stand_in.load = lambda stream, **options: Unpickler(stream, **options).load()  # type: ignore[attr-defined]
+    return stand_in
+
+
+def _import(module: str) -> Any:
+    try:
+        return __import__(module, fromlist=["_"])
+    except ModuleNotFoundError as error:
+        raise MissingDependencyError(
+            f"reading network weights needs the package '{error.name}', which is not installed: "
+            f"run `make install-nets` (or `pip install 'hat_ros[nets]'`)"
+        ) from None
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:160]
+
+
+def _some(keys: list[str]) -> str:
+    return f" ({', '.join(keys[:3])}{', ...' if len(keys) > 3 else ''})" if keys else ""

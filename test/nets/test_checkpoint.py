@@ -1,0 +1,166 @@
+"""Weights on disk: where they are looked for, what is refused, and that reading a pickle runs nothing."""
+
+import os
+import pickle
+
+import pytest
+
+from hat_ros.errors import WeightsError
+from hat_ros.nets import checkpoint
+from hat_ros.nets.checkpoint import CHECKPOINTS, check, convert, find, load_into, load_state, weights_folder
+
+torch = pytest.importorskip("torch")
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("HAT_WEIGHTS", str(tmp_path))
+    return tmp_path
+
+
+@pytest.fixture
+def toy(monkeypatch):
+    """Register a small checkpoint 'toy' whose checksum is that of whatever file was written last."""
+
+    def register(path=None, **fields):
+        digest = checkpoint.sha256_of(path) if path else "0" * 64
+        entry = checkpoint.Checkpoint("toy", "toy.pth", "https://example.org", "MIT", **({"sha256": digest} | fields))
+        monkeypatch.setitem(CHECKPOINTS, "toy", entry)
+        return entry
+
+    return register
+
+
+def test_folder_is_argument_then_environment_then_user_data(monkeypatch, tmp_path):
+    monkeypatch.setenv("HAT_WEIGHTS", str(tmp_path / "env"))
+    assert weights_folder(tmp_path / "given") == tmp_path / "given"
+    assert weights_folder() == tmp_path / "env"
+    monkeypatch.delenv("HAT_WEIGHTS")
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    assert weights_folder() == tmp_path / "data" / "hat_ros" / "weights"
+
+
+@pytest.mark.parametrize("name", CHECKPOINTS)
+def test_missing_file_error_says_all_that_one_needs(folder, name):
+    entry = CHECKPOINTS[name]
+    with pytest.raises(WeightsError) as caught:
+        find(name)
+    message = str(caught.value)
+    for part in (entry.filename, entry.source, entry.sha256 or "none published", entry.licence, str(folder)):
+        assert part in message
+    assert "\n" not in message
+    status = check(name)
+    assert not status.usable and status.path is None and status.message == message
+
+
+def test_unknown_name_lists_the_known():
+    with pytest.raises(WeightsError, match="known are droid, megapose_coarse"):
+        find("droidd")
+
+
+def test_altered_file_is_refused_before_it_is_opened(folder):
+    (folder / "droid.pth").write_bytes(pickle.dumps(_Bomb(folder / "ran")))
+    with pytest.raises(WeightsError, match="published is 46476ef6"):
+        load_state("droid")
+    with pytest.raises(WeightsError, match="published is 46476ef6"):
+        convert("droid")
+    assert not check("droid").usable
+    assert not (folder / "ran").exists()
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_load_strips_opens_and_cuts(folder, toy, legacy):
+    weight = torch.arange(12.0).reshape(3, 4)
+    torch.save(
+        {"state_dict": {"module.a.weight": weight, "other": torch.ones(2)}},
+        folder / "toy.pth",
+        _use_new_zipfile_serialization=not legacy,
+    )
+    toy(folder / "toy.pth", container="state_dict", renames=(("module.", ""),), cut_rows=(("a.weight", 2),))
+    state = load_state("toy")
+    assert set(state) == {"a.weight", "other"}
+    assert torch.equal(state["a.weight"], weight[:2])
+    assert check("toy").usable
+    converted = convert("toy")
+    assert converted == folder / "toy.safetensors" and find("toy") == converted and check("toy").usable
+    again = load_state("toy")
+    assert set(again) == set(state) and all(torch.equal(again[k], state[k]) for k in state)
+
+
+class _Bomb:
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.path),)
+
+
+class _Settings(dict):
+    pass
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_pickled_extras_are_never_run(folder, toy, legacy):
+    """A file with more than tensors is not opened directly; conversion keeps the tensors and drops the rest."""
+    weight = torch.linspace(0, 1, 7)
+    extras = {"bomb": _Bomb(folder / "ran"), "settings": _Settings(a=[1, 2]), "shape": torch.Size([2])}
+    torch.save(
+        {"state_dict": {"network.w": weight}, "hyper_parameters": extras},
+        folder / "toy.pth",
+        _use_new_zipfile_serialization=not legacy,
+    )
+    toy(folder / "toy.pth", container="state_dict", renames=(("network.", ""),))
+    with pytest.raises(WeightsError, match="hat weights convert toy"):
+        load_state("toy")
+    convert("toy")
+    assert torch.equal(load_state("toy")["w"], weight)
+    assert not (folder / "ran").exists()
+
+
+@pytest.mark.parametrize("content", [b"", b"\x00" * 100, b"PK\x03\x04junk", pickle.dumps([1, 2])])
+def test_rubbish_is_one_clear_error(folder, toy, content):
+    (folder / "toy.pth").write_bytes(content)
+    toy(folder / "toy.pth")
+    for action in (load_state, convert):
+        with pytest.raises(WeightsError):
+            action("toy")
+    (folder / "toy.safetensors").write_bytes(content)
+    with pytest.raises(WeightsError, match="not a readable safetensors"):
+        load_state("toy")
+
+
+def test_no_state_dict_inside_is_an_error(folder, toy):
+    torch.save({"model": {"a": torch.ones(1)}}, folder / "toy.pth")
+    toy(folder / "toy.pth", container="state_dict")
+    with pytest.raises(WeightsError, match="under 'state_dict'"):
+        load_state("toy")
+
+
+def test_missing_companion_is_reported(folder, toy):
+    torch.save({"a": torch.ones(1)}, folder / "toy.pth")
+    toy(folder / "toy.pth", companions=(("config.yaml", "1" * 64),))
+    assert "config.yaml is missing" in check("toy").message
+    (folder / "config.yaml").write_text("x: 1")
+    assert "published is 1111" in check("toy").message
+
+
+def test_load_into_is_strict():
+    module = torch.nn.Linear(3, 2)
+    state = {"weight": torch.ones(2, 3), "bias": torch.zeros(2)}
+    load_into(module, state, "toy")
+    assert torch.equal(module.weight, torch.ones(2, 3))
+    for wrong, text in (
+        ({"weight": state["weight"]}, r"1 tensors missing \(bias\)"),
+        (state | {"more": torch.ones(1)}, r"1 unknown \(more\)"),
+        (state | {"weight": torch.ones(3, 3)}, r"shape \(2, 3\), found \(3, 3\)"),
+        (state | {"bias": torch.tensor([0.0, float("nan")])}, "not finite"),
+    ):
+        with pytest.raises(WeightsError, match=text):
+            load_into(module, wrong, "toy")
+
+
+def test_registry_is_consistent():
+    for name, entry in CHECKPOINTS.items():
+        assert entry.name == name
+        assert entry.sha256 == "" or len(entry.sha256) == 64
+        assert all(len(digest) == 64 for _, digest in entry.companions)
