@@ -1,0 +1,1 @@
+"""Stage 1: where the target is in the image. One file per backend, chosen by ``segmentation.backend``."""
