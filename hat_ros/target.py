@@ -49,6 +49,8 @@ class Surface:
     Attributes:
         corner_uv: (F, 3, 2) float32 texture coordinates of the corners, glTF sense (v up), zero without texture.
         corner_rgb: (F, 3, 3) uint8 vertex colours (sRGB), or None when no part has any.
+        corner_normal: (F, 3, 3) float32 unit shading normals of the file in the target frame; the face's own where a
+            part of the file has none.
         texture_id: (F,) int16 index into ``textures``, -1 = the face's own colour.
         textures: (h, w, 3) uint8 images, sRGB, colour factors already applied.
         roughness: (F,) float32, 0 mirror to 1 matt.
@@ -57,6 +59,7 @@ class Surface:
 
     corner_uv: NDArray[np.float32]
     corner_rgb: NDArray[np.uint8] | None
+    corner_normal: NDArray[np.float32]
     texture_id: NDArray[np.int16]
     textures: tuple[NDArray[np.uint8], ...]
     roughness: NDArray[np.float32]
@@ -187,6 +190,7 @@ class _Part:
     corners_m: NDArray[np.float64]  # (F, 3, 3)
     corner_uv: NDArray[np.float32]  # (F, 3, 2)
     corner_rgb: NDArray[np.uint8] | None  # (F, 3, 3)
+    corner_normal: NDArray[np.float32]  # (F, 3, 3)
     rgb: NDArray[np.uint8]  # (F, 3)
     texture: NDArray[np.uint8] | None
     roughness: float
@@ -218,7 +222,23 @@ def _part(scene: trimesh.Scene, node: str, name: str) -> _Part | None:
         corner_rgb = np.asarray(visual.vertex_colors, dtype=np.uint8)[:, :3][faces]
     elif visual.kind == "face":
         rgb = np.asarray(visual.face_colors, dtype=np.uint8)[:, :3].copy()
-    return _Part(vertices[faces], corner_uv, corner_rgb, rgb, texture, roughness, metallic)
+    normal = _corner_normals(mesh, vertices[faces], faces, T[:3, :3])
+    return _Part(vertices[faces], corner_uv, corner_rgb, normal, rgb, texture, roughness, metallic)
+
+
+def _corner_normals(
+    mesh: trimesh.Trimesh, corners: NDArray[np.float64], faces: NDArray[np.int64], linear: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Unit (F, 3, 3) normals: the file's, or the faces' own where it brings none."""
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, None].repeat(3, axis=1)
+    normal = flat
+    # trimesh would compute vertex normals on demand; only those read from the file are in its cache at this point.
+    if "vertex_normals" in mesh._cache:
+        own = np.asarray(mesh.vertex_normals, dtype=np.float64) @ np.linalg.pinv(linear)
+        normal = np.where(np.isfinite(own[faces]).all(axis=-1, keepdims=True), own[faces], flat)
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    normal = np.where(length > 1e-12, normal, flat)
+    return (normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-300)).astype(np.float32)
 
 
 def _material(material: Any) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None, float, float]:
@@ -264,6 +284,7 @@ def _surface(parts: list[_Part], keep: NDArray[np.bool_]) -> tuple[Surface, NDAr
     surface = Surface(
         np.concatenate([part.corner_uv for part in parts])[keep],
         corner_rgb,
+        np.concatenate([part.corner_normal for part in parts])[keep],
         np.concatenate(texture_id)[keep],
         tuple(textures),
         np.repeat([part.roughness for part in parts], counts).astype(np.float32)[keep],
