@@ -51,6 +51,15 @@ class ClassicalConfig:
 
 
 @dataclass(frozen=True)
+class Mask2FormerConfig:
+    """COCO instance segmentation with a class-agnostic choice."""
+
+    min_score: float = option(0.1, "instances below this score are ignored", low=0, high=1)
+    temporal_weight: float = option(1.0, "weight of the overlap with the previous mask in the choice", low=0)
+    compactness_weight: float = option(0.5, "weight of the mask filling its own convex hull in the choice", low=0)
+
+
+@dataclass(frozen=True)
 class SegmentationConfig:
     """Stage 1."""
 
@@ -58,6 +67,7 @@ class SegmentationConfig:
     box_padding: float = option(0.0, "share of width/height added on each side of a given box", low=0, high=1)
     min_area_px: int = option(60, "smallest mask that counts as a detection", low=1)
     classical: ClassicalConfig = field(default_factory=ClassicalConfig)
+    mask2former: Mask2FormerConfig = field(default_factory=Mask2FormerConfig)
 
 
 @dataclass(frozen=True)
@@ -68,6 +78,24 @@ class TemplateConfig:
 
 
 @dataclass(frozen=True)
+class MegaPoseConfig:
+    """MegaPose (published settings), also the refiner of GigaPose."""
+
+    refiner_iterations: int = option(5, "render-and-compare iterations per candidate", low=0, high=50)
+    box_padding: float = option(0.2, "share of width/height added on each side of the detection box", low=0, high=1)
+    batch_size: int = option(64, "images per network pass; memory against speed", low=1, high=4096)
+
+
+@dataclass(frozen=True)
+class PicoPoseConfig:
+    """PicoPose (published settings), also the templates of GigaPose."""
+
+    ransac_threshold_px: float = option(2.0, "reprojection error of a PnP inlier, image pixels", low=0.01)
+    ransac_iterations: int = option(150, "PnP-RANSAC iterations", low=1)
+    batch_size: int = option(16, "templates per transformer pass at start-up", low=1, high=1024)
+
+
+@dataclass(frozen=True)
 class HypothesesConfig:
     """Stage 2."""
 
@@ -75,6 +103,8 @@ class HypothesesConfig:
     max_candidates: int = option(10, "K: pose hypotheses per keyframe", low=1, high=64)
     guard: bool = option(False, "drop implausible candidates (score, depth, range) before selection")
     template: TemplateConfig = field(default_factory=TemplateConfig)
+    megapose: MegaPoseConfig = field(default_factory=MegaPoseConfig)
+    picopose: PicoPoseConfig = field(default_factory=PicoPoseConfig)
 
 
 @dataclass(frozen=True)
@@ -156,6 +186,15 @@ class PriorConfig:
 
 
 @dataclass(frozen=True)
+class NetsConfig:
+    """Where and how the learned backends run."""
+
+    device: str = option("auto", "auto (an accelerator if there is one), cpu or cuda", choices=("auto", "cpu", "cuda"))
+    precision: str = option("float32", "arithmetic on an accelerator", choices=("float32", "float16", "bfloat16"))
+    weights_folder: str = option("", "folder of the checkpoints; empty: HAT_WEIGHTS, else the user's data folder")
+
+
+@dataclass(frozen=True)
 class GraphConfig:
     """The ROS graph."""
 
@@ -176,6 +215,7 @@ class HatConfig:
     fusion: FusionConfig = field(default_factory=FusionConfig)
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
     prior: PriorConfig = field(default_factory=PriorConfig)
+    nets: NetsConfig = field(default_factory=NetsConfig)
     graph: GraphConfig = field(default_factory=GraphConfig)
 
     def __post_init__(self) -> None:
