@@ -1,0 +1,61 @@
+"""The command line ``hat``. One file per group of commands; heavy imports happen inside the commands.
+
+Exit codes: 0 done, 1 the run failed, 2 bad input, 130 stopped by Ctrl-C. An error that the user can put right is one
+sentence on stderr; a traceback is a bug.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from hat_ros.cli import analyse, data, run, system
+from hat_ros.errors import HatError
+
+EXIT_INTERRUPTED = 130
+
+_EPILOG = """\
+examples:
+  hat replay bags/demo --out out/demo          a recorded bag through the five-node ROS graph
+  hat track bags/demo --out out/track          the same in this process, no ROS needed
+  hat import sequence CLIP --out bags/clip     a folder of images to a bag
+  hat bench CLIP CLIP --out out/bench          every clip, every mode, one table
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of the whole command line."""
+    parser = argparse.ArgumentParser(
+        prog="hat",
+        description="Hypothesis-Anchored Tracking: causal monocular 6-DoF pose of an uncooperative spacecraft.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for group in (run, data, analyse, system):
+        group.add_commands(commands)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code."""
+    parsed = build_parser().parse_args(arguments)
+    try:
+        return parsed.command(parsed) or 0
+    except HatError as error:
+        print(f"hat: {' '.join(str(error).split())}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print(
+            "hat: stopped by Ctrl-C; what was done is in the .partial folder, if the command had begun one",
+            file=sys.stderr,
+        )
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:  # `hat ... | head`
+        sys.stderr.close()
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,7 @@
+"""``python -m hat_ros.cli``."""
+
+import sys
+
+from hat_ros.cli import main
+
+sys.exit(main())

@@ -1,0 +1,114 @@
+"""``hat evaluate``, ``hat plot``, ``hat bench``, ``hat ablate``: what the runs are worth."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from hat_ros.cli.options import Commands, add_config, natural, positive
+from hat_ros.cli.run import MODES
+
+
+def add_commands(commands: Commands) -> None:
+    """Register this group."""
+    _add_bench(commands)
+
+
+def _add_campaign(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="campaign folder; resumed if it exists")
+    add_config(parser)
+    parser.add_argument("--limit", type=positive, metavar="N", help="at most N frames per run")
+    parser.add_argument("--jobs", type=positive, default=1, metavar="N", help="runs at a time (default: 1)")
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="run on the workers of this Dask scheduler instead (extra `cluster`; shared file system)",
+    )
+
+
+def _names(*known: str) -> argparse.Action:
+    def parse(text: str) -> list[str]:
+        names = [name.strip() for name in text.split(",") if name.strip()]
+        wrong = [name for name in names if name not in known]
+        if wrong or not names:
+            raise argparse.ArgumentTypeError(f"choose from {', '.join(known)}, separated by commas; found '{text}'")
+        return list(dict.fromkeys(names))
+
+    return parse
+
+
+def _numbers(text: str) -> list[int]:
+    return list(dict.fromkeys(natural(item) for item in text.split(",")))
+
+
+def _add_bench(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "bench",
+        help="clips x methods x masks x starts in one table",
+        description="Run methods over clips, each run in a process of its own with one numerical thread, and write one "
+        "table as text, CSV, LaTeX, JSON and PNG. Runs that are done already, with the same inputs, "
+        "configuration and code, are used again.",
+    )
+    parser.add_argument(
+        "recordings",
+        nargs="+",
+        metavar="SEQ",
+        help="bag or sequence folder; SEQ@key=value[,key=value] gives one clip settings of its own",
+    )
+    _add_campaign(parser)
+    parser.add_argument(
+        "--modes",
+        type=_names(*MODES),
+        default=["hat", "independent"],
+        metavar="LIST",
+        help=f"methods, from {','.join(MODES)} (default: hat,independent)",
+    )
+    parser.add_argument(
+        "--masks",
+        type=_names("own", "given"),
+        default=["own"],
+        metavar="LIST",
+        help="own: the preset's segmentation; given: the recording's masks (default: own)",
+    )
+    parser.add_argument(
+        "--start",
+        type=_numbers,
+        default=[0],
+        metavar="LIST",
+        help="cold starts at these frames, e.g. 0,60,120 (default: 0)",
+    )
+    parser.add_argument("--stages", action="store_true", help="print the time per stage as well")
+    parser.set_defaults(command=_bench)
+
+
+def _bench(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from hat_ros.cli.console import campaign_progress
+    from hat_ros.evaluation import bench
+    from hat_ros.evaluation.campaign import run_campaign
+
+    jobs = bench.bench_jobs(
+        arguments.recordings,
+        arguments.modes,
+        arguments.masks,
+        arguments.start,
+        arguments.config,
+        arguments.overrides,
+        arguments.limit,
+    )
+    out = arguments.out.resolve()
+    with campaign_progress(len(jobs)) as watch:
+        outcomes = run_campaign(jobs, out, arguments.jobs, arguments.scheduler, watch)
+    table, stages = bench.bench_table(outcomes), bench.stage_table(outcomes)
+    table.write(out, "table")
+    stages.write(out, "stages")
+    console = Console(width=max(240, Console().width))
+    console.print(table.rich())
+    if arguments.stages:
+        console.print(stages.rich())
+    failures = bench.failures(outcomes)
+    for line in failures:
+        print(f"failed: {line}", file=sys.stderr)
+    return 1 if failures else 0

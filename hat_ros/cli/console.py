@@ -1,0 +1,97 @@
+"""What people see while a command runs and when it has finished."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+STATE_STYLE = {"TRACKING": "green", "COASTING": "yellow", "LOST": "red", "UNINITIALISED": "dim"}
+
+
+@contextmanager
+def progress_of(title: str, quiet: bool) -> Iterator[Callable[..., None] | None]:
+    """A progress bar with frames per second and state; yields what to call after each frame, None when quiet."""
+    if quiet:
+        yield None
+        return
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[fps]:5.1f} fps"),
+        TextColumn("{task.fields[state]}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        task = progress.add_task(title, total=None, fps=0.0, state="")
+        started = time.perf_counter()
+
+        def watch(done: Any, total: int) -> None:
+            count = progress.tasks[0].completed + 1
+            state = done.step.estimate.state.name
+            progress.update(
+                task,
+                completed=count,
+                total=total,
+                fps=count / max(1e-9, time.perf_counter() - started),
+                state=f"[{STATE_STYLE[state]}]{state}[/]",
+            )
+
+        yield watch
+
+
+def print_figures(folder: Path) -> None:
+    """The main figures of a result folder as a table on stdout."""
+    figures = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    table = Table(title=str(folder), show_header=False)
+    for label, text in figure_lines(figures):
+        table.add_row(label, text)
+    Console().print(table)
+
+
+def figure_lines(figures: dict[str, Any]) -> list[tuple[str, str]]:
+    """Label and text of the figures that people ask for first."""
+
+    def number(name: str, form: str = ".4f") -> str:
+        value = figures.get(name)
+        return "-" if value is None else format(value, form)
+
+    lines = [
+        ("frames", f"{figures['frames']} ({figures['valid']} with a pose, coverage {number('coverage', '.1%')})"),
+        ("pose error E_p", f"{number('E_p_mean')} (SD {number('E_p_sd')})"),
+        ("translation error E_t", f"{number('E_t_m_mean')} m (SD {number('E_t_m_sd')})"),
+        ("rotation error E_q", f"{number('E_q_deg_mean', '.2f')} deg (SD {number('E_q_deg_sd', '.2f')})"),
+        ("beyond 90 degrees", number("E_q_over_90_share", ".1%")),
+    ]
+    if figures.get("fps") is not None:
+        latency = f"p50 {number('latency_ms_p50', '.1f')} ms, p99 {number('latency_ms_p99', '.1f')} ms"
+        lines.append(("speed", f"{number('fps', '.1f')} frames/s, latency {latency}"))
+    return lines
+
+
+@contextmanager
+def campaign_progress(total: int) -> Iterator[Callable[[Any], None]]:
+    """A line per finished run and a bar over all of them; yields what to call with each outcome."""
+    console = Console(stderr=True)
+    columns = (TextColumn("runs"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task("runs", total=total)
+
+        def watch(outcome: Any) -> None:
+            if outcome.figures is None:
+                text = f"[red]failed[/]: {outcome.failure}"
+            else:
+                text = ", ".join(f"{label} {value}" for label, value in figure_lines(outcome.figures)[1:2])
+                text += " (done before)" if outcome.reused else ""
+            console.print(f"{outcome.job.name}: {text}", highlight=False)
+            progress.advance(task)
+
+        yield watch

@@ -1,0 +1,84 @@
+"""Options and types that several commands share."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hat_ros.config import HatConfig
+
+Commands = Any  # argparse's sub-parser action has no public name
+
+
+def add_config(parser: argparse.ArgumentParser, default: str = "default") -> None:
+    """``--config`` and ``--set``."""
+    parser.add_argument(
+        "--config",
+        default=default,
+        metavar="NAME|FILE",
+        help=f"preset name or YAML file (default: {default})",
+    )
+    parser.add_argument(
+        "--set",
+        dest="overrides",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="override one value, e.g. --set keyframes.gap_frames=4 (may be repeated)",
+    )
+
+
+def config_of(arguments: argparse.Namespace) -> HatConfig:
+    """The configuration that ``--config`` and ``--set`` ask for."""
+    from hat_ros.config import load_config
+
+    return load_config(arguments.config, arguments.overrides)
+
+
+def add_out(parser: argparse.ArgumentParser, what: str) -> None:
+    """``--out`` and ``--overwrite``."""
+    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help=what)
+    parser.add_argument("--overwrite", action="store_true", help="replace what an earlier run left in DIR")
+
+
+def add_threads(parser: argparse.ArgumentParser) -> None:
+    """``--threads``."""
+    parser.add_argument(
+        "--threads",
+        type=positive,
+        metavar="N",
+        help="threads of the numerical libraries (default: theirs)",
+    )
+
+
+def limit_threads(count: int | None) -> None:
+    """Apply ``--threads``; effective only before the numerical libraries are imported."""
+    if count is None:
+        return
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ[name] = str(count)
+    import cv2
+
+    cv2.setNumThreads(count)
+
+
+def positive(text: str) -> int:
+    """An integer of at least 1."""
+    value = natural(text)
+    if value == 0:
+        raise argparse.ArgumentTypeError(f"must be at least 1, found {text}")
+    return value
+
+
+def natural(text: str) -> int:
+    """An integer of at least 0."""
+    try:
+        value = int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be a whole number, found '{text}'") from None
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"must not be negative, found {text}")
+    return value

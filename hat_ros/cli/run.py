@@ -1,0 +1,61 @@
+"""``hat replay``, ``hat track``, ``hat temporal``: poses from recordings."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from hat_ros.cli.options import Commands, add_config, add_out, add_threads, config_of, limit_threads, natural, positive
+
+MODES = ("hat", "independent", "tracking", "offline")
+
+
+def add_commands(commands: Commands) -> None:
+    """Register this group."""
+    _add_track(commands)
+
+
+def _add_track(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "track",
+        help="a recording through the method in this process, no ROS needed",
+        description="Run the method over a bag or a sequence folder in this process and write a result folder. "
+        "Gives the same bytes as `hat replay`.",
+    )
+    parser.add_argument("recording", type=Path, help="bag, or folder of the `sequence` layout")
+    add_out(parser, "result folder to write")
+    add_config(parser)
+    parser.add_argument(
+        "--mode",
+        choices=MODES,
+        default="hat",
+        help="hat: the paper's method; independent: best hypothesis of every frame; tracking: refine the last pose; "
+        "offline: all frames jointly, not causal (default: hat)",
+    )
+    parser.add_argument("--start", type=natural, default=0, metavar="N", help="skip the first N frames (cold start)")
+    parser.add_argument("--limit", type=positive, metavar="N", help="process at most N frames")
+    parser.add_argument("--no-video", action="store_true", help="do not write the overlay video")
+    parser.add_argument("--no-report", action="store_true", help="do not write report.html")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar, no table")
+    add_threads(parser)
+    parser.set_defaults(command=_track)
+
+
+def _track(arguments: argparse.Namespace) -> int:
+    limit_threads(arguments.threads)
+    from hat_ros.cli.console import print_figures, progress_of
+    from hat_ros.runner import TrackOptions, track
+
+    options = TrackOptions(
+        mode=arguments.mode,
+        start=arguments.start,
+        limit=arguments.limit,
+        video=not arguments.no_video,
+        report=not arguments.no_report,
+        overwrite=arguments.overwrite,
+    )
+    with progress_of("tracking", arguments.quiet) as watch:
+        folder = track(arguments.recording, arguments.out, config_of(arguments), options, watch)
+    if not arguments.quiet:
+        print_figures(folder)
+    return 0

@@ -1,0 +1,190 @@
+"""Many independent runs: each in a process of its own, resumable, failures kept apart.
+
+A run is known by what determines its result: the recording's bytes, the configuration, the code, the mode and the
+frame range. A finished run folder with the same fingerprint is used again, so an interrupted campaign goes on where it
+stopped and its tables come out with the same bytes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from hat_ros.config import load_config
+from hat_ros.errors import RunError
+from hat_ros.provenance import code_hash, config_hash, input_hash
+from hat_ros.results import METRICS_FILE, RUN_FILE
+
+# One thread per run: timings are comparable, and N jobs use N cores.
+_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of ``hat track``.
+
+    Attributes:
+        name: unique within the campaign; the run's folder.
+        recording: bag or sequence folder.
+        mode: method.
+        config: preset name or YAML file.
+        overrides: ``key=value`` settings on top of it.
+        start: frames skipped.
+        limit: at most this many frames.
+        labels: what the tables call it, column by column.
+    """
+
+    name: str
+    recording: Path
+    mode: str = "hat"
+    config: str = "default"
+    overrides: tuple[str, ...] = ()
+    start: int = 0
+    limit: int | None = None
+    labels: dict[str, str] = field(default_factory=dict)
+
+    def fingerprint(self) -> dict[str, Any]:
+        """What ``run.json`` of this run must hold."""
+        return {
+            "source_sha256": _input_hash(self.recording),
+            "config_sha256": config_hash(load_config(self.config, self.overrides)),
+            "code_sha256": code_hash(),
+            "mode": self.mode,
+            "start": self.start,
+            "limit": self.limit,
+        }
+
+    def command(self, folder: Path) -> list[str]:
+        """The command line that makes ``folder``."""
+        command = [sys.executable, "-m", "hat_ros.cli", "track", str(self.recording), "--out", str(folder)]
+        command += ["--mode", self.mode, "--config", self.config, "--start", str(self.start), "--threads", "1"]
+        command += ["--no-video", "--no-report", "--quiet", "--overwrite"]
+        if self.limit is not None:
+            command += ["--limit", str(self.limit)]
+        for override in self.overrides:
+            command += ["--set", override]
+        return command
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a job: its figures, or the sentence that says why there are none."""
+
+    job: Job
+    folder: Path
+    figures: dict[str, Any] | None
+    failure: str = ""
+    reused: bool = False
+
+
+@cache
+def _input_hash(path: Path) -> str:
+    return input_hash(path)
+
+
+def run_campaign(
+    jobs: Sequence[Job],
+    out: Path,
+    n_jobs: int = 1,
+    scheduler: str | None = None,
+    watch: Callable[[Outcome], None] | None = None,
+) -> list[Outcome]:
+    """Run what is not done yet, ``n_jobs`` at a time; one job's failure does not stop the others.
+
+    Args:
+        jobs: with unique names.
+        out: campaign folder; runs go to ``out/runs/<job name>``.
+        n_jobs: processes at a time on this machine.
+        scheduler: address of a Dask scheduler that shares this file system; its workers run the jobs instead.
+        watch: called with each outcome as it comes.
+
+    Returns:
+        Outcomes in the order of ``jobs``.
+
+    Raises:
+        RunError: the campaign folder cannot be written.
+        MissingDependencyError: a scheduler is asked for but ``distributed`` is not installed.
+    """
+    runs = out / "runs"
+    try:
+        runs.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(f"cannot create {runs}: {error.strerror}") from None
+    execute = _on_this_machine(n_jobs) if scheduler is None else _on_cluster(scheduler)
+    outcomes: dict[str, Outcome] = {}
+    for outcome in execute([(job, runs / job.name) for job in jobs]):
+        outcomes[outcome.job.name] = outcome
+        if watch is not None:
+            watch(outcome)
+    return [outcomes[job.name] for job in jobs]
+
+
+def run_job(job: Job, folder: Path) -> Outcome:
+    """Run one job in a process of its own, unless it is done already."""
+    if (figures := _finished(job, folder)) is not None:
+        return Outcome(job, folder, figures, reused=True)
+    environment = os.environ | dict.fromkeys(_ONE_THREAD, "1")
+    done = subprocess.run(job.command(folder), capture_output=True, text=True, env=environment)
+    if done.returncode != 0:
+        lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+        (folder.parent / f"{folder.name}.log").write_text(done.stderr, encoding="utf-8")
+        return Outcome(job, folder, None, lines[-1])
+    return Outcome(job, folder, json.loads((folder / METRICS_FILE).read_text(encoding="utf-8")))
+
+
+def _finished(job: Job, folder: Path) -> dict[str, Any] | None:
+    try:
+        run = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+        figures = json.loads((folder / METRICS_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return figures if all(run.get(key) == value for key, value in job.fingerprint().items()) else None
+
+
+Work = Sequence[tuple[Job, Path]]
+
+
+def _on_this_machine(n_jobs: int) -> Callable[[Work], Iterator[Outcome]]:
+    def execute(work: Work) -> Iterator[Outcome]:
+        with ThreadPoolExecutor(n_jobs) as pool:
+            try:
+                futures = [pool.submit(run_job, job, folder) for job, folder in work]
+                for future in as_completed(futures):
+                    yield future.result()
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+
+    return execute
+
+
+def _on_cluster(address: str) -> Callable[[Work], Iterator[Outcome]]:
+    try:
+        from distributed import Client
+        from distributed import as_completed as as_completed_there
+    except ModuleNotFoundError:
+        from hat_ros.errors import MissingDependencyError
+
+        raise MissingDependencyError(
+            "--scheduler needs the package 'distributed', which is not installed: pip install 'hat_ros[cluster]'"
+        ) from None
+
+    def execute(work: Work) -> Iterator[Outcome]:
+        try:
+            client = Client(address, timeout="20s")
+        except OSError as error:
+            raise RunError(f"no Dask scheduler answers at {address} ({error})") from None
+        with client:
+            futures = [client.submit(run_job, job, folder, pure=False, retries=1) for job, folder in work]
+            for future in as_completed_there(futures):
+                yield future.result()
+
+    return execute

@@ -1,0 +1,112 @@
+"""Other ways to turn the same front ends into poses, to compare HAT with.
+
+* ``independent``: hypotheses at every frame; the best appearance is the output. No memory.
+* ``tracking``: refine the previous pose on each image; the best appearance only to (re-)start. No decoder, no fusion.
+* ``offline``: HAT's observations, then a backtrace and one joint optimisation of all frames. Not causal: a reference.
+
+Each offers what :class:`~hat_ros.tracker.HatTracker` offers, so the pipeline runs them all alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from hat_ros.config import HatConfig
+from hat_ros.errors import UsageError
+from hat_ros.hypotheses.stage import HypothesisStage
+from hat_ros.segmentation.stage import SegmentationStage
+from hat_ros.target import Target
+from hat_ros.tracker import HatTracker, Step
+from hat_ros.types import Candidates, Detection, Estimate, Frame, Motion, Selection, TrackState
+
+MODES = ("hat", "independent", "tracking", "offline")
+
+_NO_POSE = np.full(7, np.nan)
+_NO_COVARIANCE = np.full((6, 6), np.nan)
+
+
+class Method(Protocol):
+    """What turns frames into poses."""
+
+    stages: dict[str, Any]
+    """Stage name -> the object whose ``update`` is that stage; for timing."""
+
+    def step(self, frame: Frame) -> Step:
+        """Process one frame, stamps strictly increasing."""
+        ...
+
+    def finish(self) -> list[Estimate]:
+        """Estimates that replace those of the steps; empty for a causal method."""
+        ...
+
+
+def create_method(mode: str, config: HatConfig, target: Target) -> Method:
+    """Build the method that ``--mode`` names.
+
+    Raises:
+        UsageError: unknown mode.
+        ConfigError: the configuration names an unknown backend.
+    """
+    methods = {"hat": Hat, "independent": Independent}
+    if mode not in methods:
+        raise UsageError(f"mode '{mode}' is unknown, choose one of {', '.join(MODES)}")
+    return methods[mode](config, target)
+
+
+class Hat:
+    """The method of the paper, as :class:`HatTracker` runs it."""
+
+    def __init__(self, config: HatConfig, target: Target) -> None:
+        self._tracker = HatTracker(config, target)
+        self.stages = {
+            name: getattr(self._tracker, name)
+            for name in ("segmentation", "hypotheses", "motion", "selector", "fusion")
+        }
+
+    def step(self, frame: Frame) -> Step:
+        """See :meth:`HatTracker.step`."""
+        return self._tracker.step(frame)
+
+    def finish(self) -> list[Estimate]:
+        """Nothing: HAT never revises."""
+        return []
+
+
+class Independent:
+    """Every frame for itself: its best-scored hypothesis, or no pose."""
+
+    def __init__(self, config: HatConfig, target: Target) -> None:
+        config = replace(config, keyframes=replace(config.keyframes, gap_frames=1))
+        self._segmentation = SegmentationStage(config, target)
+        self._hypotheses = HypothesisStage(config, target)
+        self.stages = {"segmentation": self._segmentation, "hypotheses": self._hypotheses}
+
+    def step(self, frame: Frame) -> Step:
+        """One image, one answer."""
+        detection = self._segmentation.update(frame, None)
+        candidates = self._hypotheses.update(frame, detection, None)
+        return _step(detection, candidates, _best_appearance(frame, candidates))
+
+    def finish(self) -> list[Estimate]:
+        """Nothing: every answer is final."""
+        return []
+
+
+def _best_appearance(frame: Frame, candidates: Candidates) -> Estimate:
+    found = len(candidates) > 0 and bool(np.isfinite(candidates.log_score[0]))
+    return Estimate(
+        frame.stamp_ns,
+        TrackState.TRACKING if found else TrackState.LOST,
+        candidates.pose_rows[0] if found else _NO_POSE,
+        _NO_COVARIANCE,
+        keyframe=len(candidates) > 0,
+        n_candidates=len(candidates),
+        anchor=0 if found else -1,
+    )
+
+
+def _step(detection: Detection | None, candidates: Candidates, estimate: Estimate) -> Step:
+    return Step(detection, candidates, Motion.none(), Selection.none(), estimate)

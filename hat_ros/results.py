@@ -1,0 +1,177 @@
+"""The result folder: written as ``NAME.partial``, renamed when complete; what a stopped run left stays readable.
+
+bag/            result bag: all /hat topics except images, /target_pose, the truth if known
+poses.tum       stamp x y z qx qy qz qw of every published T_cam_target
+poses.csv       every admitted frame: stamp, state, pose, errors
+frames.csv      every admitted frame: latency, time per stage, mask overlap (what the run measured)
+config.yaml     the configuration as used
+run.json        where it came from: command, commit, versions, input hashes
+metrics.json    figures (DESIGN section 6)
+report.html     plots, overlay frames, table; one file, no network
+overlay.mp4     the clip with the CAD outline drawn in
+"""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import TextIO
+
+import numpy as np
+import yaml
+
+from hat_ros.config import HatConfig, config_to_dict
+from hat_ros.errors import RunError, UsageError
+from hat_ros.evaluation.metrics import pose_errors
+from hat_ros.evaluation.runlog import RunLog
+from hat_ros.types import Estimate, TrackState
+
+BAG_FOLDER = "bag"
+METRICS_FILE = "metrics.json"
+CONFIG_FILE = "config.yaml"
+RUN_FILE = "run.json"
+
+POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+CSV_COLUMNS = (
+    "stamp_ns",
+    "state",
+    *POSE_COLUMNS,
+    "keyframe",
+    "n_candidates",
+    "anchor",
+    "gap_frames",
+    "E_t_m",
+    "E_q_deg",
+    "E_p",
+)
+
+
+class ResultFolder:
+    """A result folder under construction; a context manager.
+
+    Leaving the ``with`` block normally renames ``NAME.partial`` to ``NAME``; leaving it by an exception keeps
+    ``NAME.partial`` with everything written so far.
+
+    Args:
+        path: where the finished folder shall be.
+        overwrite: replace a finished folder that is there already.
+
+    Raises:
+        UsageError: the folder exists and ``overwrite`` is false, or it is no result folder of ours.
+        RunError: it cannot be created.
+    """
+
+    def __init__(self, path: str | Path, overwrite: bool = False) -> None:
+        self.final_path = Path(path)
+        self.path = self.final_path.with_name(self.final_path.name + ".partial")
+        self._overwrite = overwrite
+        if self.final_path.exists():
+            if not overwrite:
+                raise UsageError(f"--out {self.final_path} exists already: choose another folder or add --overwrite")
+            _check_ours(self.final_path)
+        if self.path.exists():
+            _check_ours(self.path)
+
+    @property
+    def bag_path(self) -> Path:
+        """Where the result bag goes."""
+        return self.path / BAG_FOLDER
+
+    def __enter__(self) -> ResultFolder:
+        try:
+            if self.path.exists():  # left by a run that was stopped; this one replaces it
+                shutil.rmtree(self.path)
+            self.path.mkdir(parents=True)
+        except OSError as error:
+            raise RunError(f"cannot create {self.path}: {error.strerror}") from None
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is not None:
+            return
+        if self.final_path.exists():
+            shutil.rmtree(self.final_path)
+        self.path.rename(self.final_path)
+
+
+def _check_ours(path: Path) -> None:
+    """Refuse to delete a folder that no run has made."""
+    if not path.is_dir() or (any(path.iterdir()) and not (path / CONFIG_FILE).is_file()):
+        raise UsageError(f"{path} exists and is not a result folder: choose another --out")
+
+
+def write_config(path: Path, config: HatConfig) -> None:
+    """Write the configuration as used, complete."""
+    text = yaml.safe_dump(config_to_dict(config), sort_keys=False)
+    (path / CONFIG_FILE).write_text(text, encoding="utf-8")
+
+
+class LiveTables:
+    """Pose tables that grow with the run, flushed line by line, so that a stopped run leaves what it knew.
+
+    Args:
+        path: the result folder under construction.
+        measured: names of the values per frame that go into ``frames.csv``.
+    """
+
+    def __init__(self, path: Path, measured: Sequence[str]) -> None:
+        self._stack = ExitStack()
+        self._tum = self._open(path / "poses.tum")
+        self._frames = csv.writer(self._open(path / "frames.csv"), lineterminator="\n")
+        self._frames.writerow(("stamp_ns", "state", *measured))
+
+    def _open(self, path: Path) -> TextIO:
+        return self._stack.enter_context(path.open("w", encoding="utf-8", buffering=1, newline=""))
+
+    def add(self, estimate: Estimate, measured: Iterable[float]) -> None:
+        """Append one frame."""
+        if estimate.state.has_pose:
+            self._tum.write(tum_line(estimate.stamp_ns, estimate.pose_row))
+        cells = ("" if np.isnan(value) else f"{value:.4f}" for value in measured)
+        self._frames.writerow((estimate.stamp_ns, estimate.state.name, *cells))
+
+    def close(self) -> None:
+        """Close the files."""
+        self._stack.close()
+
+
+def write_tables(path: Path, log: RunLog) -> None:
+    """``poses.tum`` and ``poses.csv`` of a finished run."""
+    errors = pose_errors(log.T_est, log.T_true)
+    with (path / "poses.tum").open("w", encoding="utf-8", newline="") as tum:
+        for i in np.flatnonzero(log.has_output):
+            tum.write(tum_line(int(log.stamp_ns[i]), log.pose_rows[i]))
+    with (path / "poses.csv").open("w", encoding="utf-8", newline="") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(CSV_COLUMNS)
+        for i in range(len(log)):
+            pose = log.pose_rows[i] if log.has_output[i] else np.full(7, np.nan)
+            table.writerow(
+                (
+                    int(log.stamp_ns[i]),
+                    TrackState(int(log.state[i])).name,
+                    *_cells(pose),
+                    int(log.keyframe[i]),
+                    len(log.candidates[i]),
+                    int(log.anchor[i]),
+                    int(log.gap_frames[i]),
+                    *_cells((errors.translation_m[i], np.degrees(errors.rotation_rad[i]), errors.pose[i])),
+                )
+            )
+
+
+def tum_line(stamp_ns: int, pose_row: np.ndarray) -> str:
+    """One line of a TUM trajectory: seconds to the nanosecond, then the pose in full precision."""
+    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+    return f"{seconds}.{nanoseconds:09d} " + " ".join(repr(float(value)) for value in pose_row) + "\n"
+
+
+def _cells(values: Iterable[float]) -> list[str]:
+    """Numbers in full precision, an empty cell for NaN."""
+    return ["" if np.isnan(value) else repr(float(value)) for value in values]
