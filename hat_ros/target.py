@@ -246,8 +246,9 @@ def _material(material: Any) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | Non
     is_pbr = isinstance(material, trimesh.visual.material.PBRMaterial)
     if is_pbr:
         factor, image = material.baseColorFactor, material.baseColorTexture
-        roughness = 0.6 if material.roughnessFactor is None else float(np.clip(material.roughnessFactor, 0.05, 1))
-        metallic = 0.0 if material.metallicFactor is None else float(np.clip(material.metallicFactor, 0, 1))
+        # What glTF leaves out is 1: matt metal.
+        roughness = 1.0 if material.roughnessFactor is None else float(np.clip(material.roughnessFactor, 0.05, 1))
+        metallic = 1.0 if material.metallicFactor is None else float(np.clip(material.metallicFactor, 0, 1))
     else:
         factor, image = getattr(material, "diffuse", None), getattr(material, "image", None)
         roughness, metallic = 0.6, 0.0

@@ -60,7 +60,7 @@ class EmbreeRenderer:
         self.caster = RayCaster(target)
         corners = target.vertices_m[target.faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        self._face_normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        self.face_normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
         try:
             self._hull_m = target.vertices_m[ConvexHull(target.vertices_m).vertices]
         except QhullError:  # a flat model
@@ -73,7 +73,7 @@ class EmbreeRenderer:
         normal = np.zeros((*shape, 3), np.float32)
         face_id = np.full(shape, -1, np.int32)
         rgb = np.zeros((*shape, 3), np.uint8)
-        x0, y0, x1, y1 = self._pixel_bounds(T_cam_target, camera)
+        x0, y0, x1, y1 = self.pixel_bounds(T_cam_target, camera)
         if x0 >= x1 or y0 >= y1:
             return Rendering(depth, normal, face_id, rgb)
 
@@ -85,7 +85,7 @@ class EmbreeRenderer:
         hit = np.flatnonzero(face >= 0)
         rows, cols = hit // (x1 - x0) + y0, hit % (x1 - x0) + x0
         face = face[hit]
-        n = self._face_normals[face] @ R.T
+        n = self.face_normals[face] @ R.T
         n[np.einsum("nk,nk->n", n, directions_cam[hit]) > 0] *= -1.0
         depth[rows, cols] = z[hit]
         normal[rows, cols] = n
@@ -94,7 +94,7 @@ class EmbreeRenderer:
             rgb[rows, cols] = self._target.surface.sample(face, barycentric[hit], self._target.face_rgb)
         return Rendering(depth, normal, face_id, rgb)
 
-    def _pixel_bounds(self, T_cam_target: NDArray[np.float64], camera: Camera) -> tuple[int, int, int, int]:
+    def pixel_bounds(self, T_cam_target: NDArray[np.float64], camera: Camera) -> tuple[int, int, int, int]:
         """Half-open pixel range that can see the target: x0, y0, x1, y1."""
         points = self._hull_m @ T_cam_target[:3, :3].T + T_cam_target[:3, 3]
         if points[:, 2].max() <= 0:
