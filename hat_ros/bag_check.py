@@ -1,0 +1,84 @@
+"""What must hold of an MCAP file before a parser allocates anything from what it declares (DESIGN section 7).
+
+MCAP layout: https://mcap.dev/spec (magic, records of one opcode byte and a 64-bit length, chunks with their declared
+uncompressed size).
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from pathlib import Path
+from typing import BinaryIO
+
+import lz4.frame
+import zstandard
+
+from hat_ros.errors import BagError
+
+MAX_CHUNK_BYTES = 512 * 2**20
+
+_MAGIC = b"\x89MCAP0\r\n"
+_CHUNK = 0x06
+_FOOTER = 0x02
+
+
+def check_mcap(path: Path) -> None:
+    """Walk the records of a file: complete, ended by a footer, no chunk larger than declared or allowed.
+
+    Raises:
+        BagError: truncated, not MCAP, or a decompression bomb.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        if file.read(8) != _MAGIC:
+            raise BagError(f"{path} is not an MCAP file")
+        end = size - len(_MAGIC)
+        opcode = 0
+        while (at := file.tell()) < end:
+            header = file.read(9)
+            if len(header) < 9:
+                raise BagError(f"{path} is truncated at byte {at} of {size}: record or copy it again")
+            opcode, length = struct.unpack("<BQ", header)
+            if at + 9 + length > end:
+                raise BagError(f"{path} is truncated or damaged: a record at byte {at} reaches beyond the file's end")
+            if opcode == _CHUNK:
+                _check_chunk(file, path, length)
+            file.seek(at + 9 + length)
+        if opcode != _FOOTER or file.read() != _MAGIC:
+            raise BagError(f"{path} is truncated: it has no MCAP footer (was the recording interrupted?)")
+
+
+def _check_chunk(file: BinaryIO, path: Path, length: int) -> None:
+    if length < 40:
+        raise BagError(f"{path} is damaged: a chunk of {length} bytes cannot hold its own header")
+    _, _, declared, _, name_length = struct.unpack("<QQQII", file.read(32))
+    if declared > MAX_CHUNK_BYTES:
+        raise BagError(f"{path}: a chunk declares {declared} bytes, more than {MAX_CHUNK_BYTES} are refused")
+    if name_length > 16:
+        raise BagError(f"{path} is damaged: a chunk's compression name has {name_length} bytes")
+    compression = file.read(name_length).decode("ascii", errors="replace")
+    (stored,) = struct.unpack("<Q", file.read(8))
+    if stored > length - 40 - name_length:
+        raise BagError(f"{path} is damaged: a chunk's data reach beyond its record")
+    if not compression:
+        return
+    if _inflated(file.read(stored), compression, declared, path) != declared:
+        raise BagError(f"{path}: a chunk does not unpack to the {declared} bytes that it declares")
+
+
+def _inflated(data: bytes, compression: str, declared: int, path: Path) -> int:
+    """Number of bytes the data unpack to, counted up to one more than declared."""
+    count, limit = 0, declared + 1
+    try:
+        if compression == "zstd":
+            source = zstandard.ZstdDecompressor().stream_reader(io.BytesIO(data), read_across_frames=True)
+        elif compression == "lz4":
+            source = lz4.frame.LZ4FrameFile(io.BytesIO(data))
+        else:
+            raise BagError(f"{path}: chunk compression '{compression}' is not supported (zstd, lz4 or none)")
+        while count < limit and (block := source.read(min(2**20, limit - count))):
+            count += len(block)
+    except (zstandard.ZstdError, RuntimeError, EOFError, OSError) as error:
+        raise BagError(f"{path} is damaged: a chunk cannot be unpacked ({error})") from None
+    return count

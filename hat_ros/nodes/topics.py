@@ -1,0 +1,69 @@
+"""Names, types and table columns of every topic (DESIGN section 4); bags need them without any middleware."""
+
+from __future__ import annotations
+
+IMAGE = "/image"
+IMAGE_COMPRESSED = "/image/compressed"
+CAMERA_INFO = "/camera_info"
+DETECTION_MASK = "/detection/mask"
+GROUND_TRUTH = "/ground_truth/target_pose"
+
+HAT_CAMERA_INFO = "/hat/camera_info"
+ADMISSION = "/hat/admission"
+FRAME = "/hat/frame"
+HYPOTHESES_SCORED = "/hat/hypotheses_scored"
+HYPOTHESES = "/hat/hypotheses"
+SLAM_STATE = "/hat/slam_state"
+SLAM_ODOMETRY = "/hat/slam_odometry"
+SELECTION = "/hat/selection"
+ANCHOR = "/hat/anchor"
+ALIGNMENT = "/hat/alignment"
+ALIGNMENT_TRANSFORM = "/hat/alignment_transform"
+STATUS = "/hat/status"
+TARGET_POSE = "/target_pose"
+TARGET_POSE_WITH_COVARIANCE = "/target_pose_with_covariance"
+TF = "/tf"
+OVERLAY = "/hat/overlay/compressed"
+DIAGNOSTICS = "/diagnostics"
+READY = "/hat/ready"
+END_OF_STREAM = "/hat/end_of_stream"
+RESET = "/hat/reset"
+
+# What a result bag holds: everything that the graph says, images excepted.
+RECORDED: dict[str, str] = {
+    HAT_CAMERA_INFO: "sensor_msgs/msg/CameraInfo",
+    ADMISSION: "sensor_msgs/msg/PointCloud2",
+    HYPOTHESES_SCORED: "sensor_msgs/msg/PointCloud2",
+    HYPOTHESES: "geometry_msgs/msg/PoseArray",
+    SLAM_STATE: "sensor_msgs/msg/PointCloud2",
+    SLAM_ODOMETRY: "nav_msgs/msg/Odometry",
+    SELECTION: "sensor_msgs/msg/PointCloud2",
+    ANCHOR: "geometry_msgs/msg/PoseStamped",
+    ALIGNMENT: "sensor_msgs/msg/PointCloud2",
+    ALIGNMENT_TRANSFORM: "geometry_msgs/msg/TransformStamped",
+    STATUS: "sensor_msgs/msg/PointCloud2",
+    TARGET_POSE: "geometry_msgs/msg/PoseStamped",
+    TARGET_POSE_WITH_COVARIANCE: "geometry_msgs/msg/PoseWithCovarianceStamped",
+    DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
+}
+
+# Columns of the table topics, in order; all FLOAT64.
+POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+CANDIDATE_COLUMNS = (*POSE_COLUMNS, "score", "rank", "bx0", "by0", "bx1", "by1")
+SELECTION_COLUMNS = (*CANDIDATE_COLUMNS, "scaled_score", "path_score", "selected")
+MOTION_COLUMNS = ("valid", "epoch", *POSE_COLUMNS, "n_keyframes")
+ALIGNMENT_COLUMNS = ("version", "scale", "qx", "qy", "qz", "qw", "tx", "ty", "tz", "n_anchors", "rms", "epoch")
+STATUS_COLUMNS = (
+    "state",
+    "seq",
+    "keyframe",
+    "n_candidates",
+    "anchor",
+    "gate_weight",
+    "alignment_version",
+    "slam_epoch",
+    "gap_frames",
+    "dropped_total",
+    *POSE_COLUMNS,
+)
+ADMISSION_COLUMNS = ("seq", "dropped_total", "epoch")
