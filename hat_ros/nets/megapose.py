@@ -8,7 +8,7 @@ over a leading axis B and work on any device.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -56,15 +56,6 @@ class RefinerNet(nn.Module):
     def forward(self, crops_and_renders: Tensor) -> Tensor:
         """(B, 27, 240, 320) -> (B, 9) update, see :func:`apply_update`."""
         return self.pose_fc(self.backbone(crops_and_renders))
-
-
-def rewrite_legacy_keys(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Names of early checkpoints in today's form."""
-    out = {}
-    for key, value in state.items():
-        key = key.replace("backbone.backbone.", "backbone.").replace("backbone.head.0.", "views_logits_head.")
-        out[key] = value
-    return out
 
 
 def build_net(kind: type[CoarseNet] | type[RefinerNet], state: Mapping[str, Tensor]) -> CoarseNet | RefinerNet:
@@ -241,7 +232,12 @@ class CropPoints:
 
 
 def score_coarse(
-    net: CoarseNet, image: Tensor, K: Tensor, T_cam_target: Tensor, points: CropPoints, renderer: ViewRenderer
+    net: Callable[[Tensor], Tensor],
+    image: Tensor,
+    K: Tensor,
+    T_cam_target: Tensor,
+    points: CropPoints,
+    renderer: ViewRenderer,
 ) -> Tensor:
     """Logits of poses by rendering each once: image (3, H, W), K (3, 3), (B, 4, 4) -> (B,)."""
     T = orthonormalise(T_cam_target)
@@ -251,13 +247,18 @@ def score_coarse(
     return score_renders(net, image, boxes, renders)
 
 
-def score_renders(net: CoarseNet, image: Tensor, boxes: Tensor, renders: Tensor) -> Tensor:
+def score_renders(net: Callable[[Tensor], Tensor], image: Tensor, boxes: Tensor, renders: Tensor) -> Tensor:
     """Logits of ready renders against the crops: (B, 4) boxes, (B, 6, 240, 320) renders -> (B,)."""
     return net(torch.cat([roi_align(image, boxes), renders], dim=1))
 
 
 def refine_once(
-    net: RefinerNet, image: Tensor, K: Tensor, T_cam_target: Tensor, points: CropPoints, renderer: ViewRenderer
+    net: Callable[[Tensor], Tensor],
+    image: Tensor,
+    K: Tensor,
+    T_cam_target: Tensor,
+    points: CropPoints,
+    renderer: ViewRenderer,
 ) -> Tensor:
     """One refiner iteration on all poses: image (3, H, W), K (3, 3), (B, 4, 4) -> (B, 4, 4)."""
     T = orthonormalise(T_cam_target)

@@ -1,0 +1,183 @@
+"""MegaPose as a hypothesis backend: 576 coarse views, the ten best refined and scored again (paper, Mega-HAT).
+
+The public multi-hypothesis RGB pipeline with two changes that the HAT authors describe: the coarse views are rendered
+once per camera and CAD model, for a centred square box of half size 0.2 min(W, H), and re-used for every image; and
+the K refined poses are all kept, with their logits as scores. Per keyframe that leaves 576 + K coarse passes and 5 K
+refiner passes, K + 20 K renders (K re-scored, 4 views x 5 iterations x K), instead of 576 more.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+from torch import Tensor
+
+from hat_ros import lie
+from hat_ros.cache import cached_arrays
+from hat_ros.config import HatConfig
+from hat_ros.nets import megapose as mp
+from hat_ros.nets.checkpoint import load_into, load_state
+from hat_ros.nets.runtime import Runtime
+from hat_ros.nets.so3_grid import so3_grid
+from hat_ros.render.network_views import NetworkViewRenderer
+from hat_ros.target import Target
+from hat_ros.types import Camera, Candidates, Detection, Frame, PosePrior
+
+_FORMAT = 1
+_N_CROP_POINTS, _N_VIEW_POINTS = 2000, 200
+_CANONICAL_HALF_SIZE = 0.2
+_CROP_SIZE = (mp.CROP_WIDTH, mp.CROP_HEIGHT)
+
+
+class MegaPose:
+    """The two networks and the renderer around one target; also the refiner of GigaPose.
+
+    Raises:
+        WeightsError: a checkpoint is missing or does not fit.
+    """
+
+    def __init__(self, config: HatConfig, target: Target) -> None:
+        self.settings = config.hypotheses.megapose
+        self.runtime = Runtime(config.nets)
+        self.renderer = TorchViews(target, self.runtime)
+        self._coarse = self._load(mp.CoarseNet, "megapose_coarse", config.nets.weights_folder)
+        self._refiner = self._load(mp.RefinerNet, "megapose_refiner", config.nets.weights_folder)
+        self.points = crop_points(target, self.runtime)
+
+    def _load(
+        self, kind: type[mp.CoarseNet] | type[mp.RefinerNet], name: str, folder: str
+    ) -> Callable[[Tensor], Tensor]:
+        state = load_state(name, folder or None)
+        net = mp.build_net(kind, state)
+        load_into(net, state, name)
+        return self.runtime.place(net)
+
+    @torch.inference_mode()
+    def refine(self, image: Tensor, K: Tensor, T_cam_target: Tensor) -> tuple[Tensor, Tensor]:
+        """Refined poses (B, 4, 4) and their coarse logits (B,): image (3, H, W), K (3, 3), (B, 4, 4)."""
+        T = T_cam_target
+        for _ in range(self.settings.refiner_iterations):
+            T = mp.refine_once(self._refiner, image, K, T, self.points, self.renderer)
+        return T, mp.score_coarse(self._coarse, image, K, T, self.points, self.renderer)
+
+    @torch.inference_mode()
+    def score_prepared(self, image: Tensor, boxes: Tensor, renders: Tensor) -> Tensor:
+        """Coarse logits of ready uint8 renders, in batches: (3, H, W), (B, 4), (B, 6, 240, 320) -> (B,)."""
+        size = self.settings.batch_size
+        logits = []
+        for i in range(0, len(boxes), size):
+            views = renders[i : i + size].to(self.runtime.device).float() / 255
+            logits.append(mp.score_renders(self._coarse, image, boxes[i : i + size], views))
+        return torch.cat(logits)
+
+
+class MegaPoseHypotheses:
+    """Stage 2 backend ``megapose``; see the module's text."""
+
+    def __init__(self, config: HatConfig, target: Target) -> None:
+        self._megapose = MegaPose(config, target)
+        self._target = target
+        self._n_candidates = config.hypotheses.max_candidates
+        self._padding = config.hypotheses.megapose.box_padding
+        self._views: tuple[Camera, Tensor] | None = None
+
+    def generate(self, frame: Frame, detection: Detection, prior: PosePrior | None) -> Candidates:
+        """K refined poses with their logits; the prior is not used (published behaviour)."""
+        runtime = self._megapose.runtime
+        image, K = runtime.image(frame.rgb), runtime.tensor(frame.camera.K)
+        box = padded_box(detection.box_xyxy, self._padding, frame.camera)
+        T = mp.pose_from_box(self._grid, self._hull, K, runtime.tensor(box))
+        boxes = mp.crop_boxes(mp.orthonormalise(T), K.expand(len(T), 3, 3), self._megapose.points.crop, image.shape[1:])
+        logits = self._megapose.score_prepared(image, boxes, self._coarse_views(frame.camera))
+        best = logits.topk(min(self._n_candidates, len(logits))).indices
+        T, logits = self._megapose.refine(image, K, T[best])
+        return Candidates.from_matrices(T.double().cpu().numpy(), logits.double().cpu().numpy(), detection.box_xyxy)
+
+    def reset(self) -> None:
+        """Nothing is learned from earlier frames."""
+
+    @cached_property
+    def _grid(self) -> Tensor:
+        return self._megapose.runtime.tensor(lie.matrix_from_quat(so3_grid(2)))
+
+    @cached_property
+    def _hull(self) -> Tensor:
+        """Vertices that decide how far the target extends in any direction."""
+        points = self._target.vertices_m
+        with contextlib.suppress(QhullError):  # a flat model has no hull of its own
+            points = points[ConvexHull(points).vertices]
+        return self._megapose.runtime.tensor(points)
+
+    def _coarse_views(self, camera: Camera) -> Tensor:
+        """(576, 6, 240, 320) uint8, kept until the camera changes and, between runs, in the cache folder."""
+        if self._views is None or not _same_camera(self._views[0], camera):
+            key = f"{_FORMAT}:{self._target.sha256}:{camera.K.tobytes().hex()}:{camera.width}x{camera.height}"
+            arrays = cached_arrays("megapose-views", key, lambda: {"views": self._render_coarse(camera)})
+            self._views = camera, torch.from_numpy(np.array(arrays["views"]))
+        return self._views[1]
+
+    def _render_coarse(self, camera: Camera) -> NDArray[np.uint8]:
+        runtime, points = self._megapose.runtime, self._megapose.points
+        half = _CANONICAL_HALF_SIZE * min(camera.width, camera.height)
+        centre = np.array([camera.width, camera.height]) / 2
+        box = runtime.tensor(np.concatenate([centre - half, centre + half]))
+        K = runtime.tensor(camera.K)
+        T = mp.orthonormalise(mp.pose_from_box(self._grid, self._hull, K, box))
+        Ks = K.expand(len(T), 3, 3)
+        K_crop = mp.crop_intrinsics(Ks, mp.crop_boxes(T, Ks, points.crop, (camera.height, camera.width)))
+        return self._megapose.renderer.render_bytes(T, K_crop)
+
+
+class TorchViews:
+    """:class:`hat_ros.nets.megapose.ViewRenderer` on top of the ray caster."""
+
+    def __init__(self, target: Target, runtime: Runtime) -> None:
+        self._renderer = NetworkViewRenderer(target)
+        self._runtime = runtime
+
+    def render_views(self, T_cam_target: Tensor, K: Tensor) -> Tensor:
+        """(B, 4, 4), (B, 3, 3) -> (B, 6, 240, 320) float32 in [0, 1]."""
+        views = torch.from_numpy(self.render_bytes(T_cam_target, K)).to(self._runtime.device)
+        return views.float() / 255
+
+    def render_bytes(self, T_cam_target: Tensor, K: Tensor) -> NDArray[np.uint8]:
+        """(B, 4, 4), (B, 3, 3) -> (B, 6, 240, 320) uint8."""
+        poses, cameras = T_cam_target.double().cpu().numpy(), K.double().cpu().numpy()
+        views = [self._renderer.render(T, k, _CROP_SIZE) for T, k in zip(poses, cameras, strict=True)]
+        return np.ascontiguousarray(np.stack(views).transpose(0, 3, 1, 2))
+
+
+def crop_points(target: Target, runtime: Runtime) -> mp.CropPoints:
+    """Surface points that size the crops: vertices drawn with the published seed.
+
+    A model with fewer vertices than the reference draws (which then stops with an assertion) gets points drawn evenly
+    over its surface as well.
+    """
+    points = target.vertices_m
+    if len(points) < _N_CROP_POINTS:
+        corners = points[target.faces]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        rng = np.random.default_rng(0)
+        face = rng.choice(len(corners), _N_CROP_POINTS, p=area / area.sum())
+        weights = rng.dirichlet(np.ones(3), _N_CROP_POINTS)
+        points = np.concatenate([points, np.einsum("nk,nkc->nc", weights, corners[face])])
+    # RandomState, not Generator: the published networks saw crops sized by exactly this draw.
+    draw = [np.random.RandomState(0).choice(len(points), n, replace=False) for n in (_N_CROP_POINTS, _N_VIEW_POINTS)]
+    return mp.CropPoints(runtime.tensor(points[draw[0]]), runtime.tensor(points[draw[1]]))
+
+
+def padded_box(box_xyxy: NDArray[np.float64], padding: float, camera: Camera) -> NDArray[np.float64]:
+    """Box (4,) grown by a share of its size on each side and clipped to the image."""
+    margin = padding * (box_xyxy[2:] - box_xyxy[:2])
+    size = np.array([camera.width, camera.height], dtype=np.float64)
+    return np.concatenate([np.clip(box_xyxy[:2] - margin, 0, size), np.clip(box_xyxy[2:] + margin, 0, size)])
+
+
+def _same_camera(a: Camera, b: Camera) -> bool:
+    return (a.width, a.height) == (b.width, b.height) and np.array_equal(a.K, b.K)
