@@ -1,0 +1,308 @@
+"""Segmentation without weights: ``segmentation.backend: classical``.
+
+Before black sky a threshold finds what is lit. Before anything else (Earth, clouds, a laboratory) a graph cut separates
+the target, seeded by the previous mask and by the silhouette of the predicted pose, or from nothing. What it says is
+checked against the CAD model's silhouettes, and a tracked mask now and then against an independent search, so that a
+wrong mask does not keep itself alive.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hat_ros.config import HatConfig
+from hat_ros.render import create_renderer
+from hat_ros.segmentation import region, sky
+from hat_ros.segmentation.boundary import refine_outline
+from hat_ros.segmentation.shape import SilhouetteBank
+from hat_ros.target import Target
+from hat_ros.types import Detection, Frame, PosePrior
+
+Mask = NDArray[np.uint8]
+
+_SIDES = ("top", "bottom", "left", "right")
+# The motion of an outline from one frame to the next, of the target's length: 4 degrees per frame and then some.
+_MARGIN_SHARE = 0.05
+_MARGIN_PX = 2.0
+_MAX_AREA_CHANGE = 1.6  # from one frame to the next
+_MIN_CONTINUITY = 0.6  # overlap of a tracked mask with its seed
+_MIN_CONTRAST = 8.0  # 8-bit colour step across the outline below which there is no outline
+_AGREEMENT = 0.8  # overlap of two independent masks that mean the same
+_CLEARLY_BETTER = 0.02  # shape overlap by which one explanation must beat the simpler one
+_SECOND_REGION_SHARE = 0.2  # a second bright region this large makes the choice between them a question
+_MAX_RETRY_FRAMES = 8
+
+
+@dataclass(frozen=True)
+class _Window:
+    """A part of the image at reduced scale: full-resolution corner and size, reduced size, reduced colours."""
+
+    x0: int
+    y0: int
+    width: int
+    height: int
+    scale: float
+    rgb: NDArray[np.uint8]
+
+    def reduce(self, mask: Mask, shift_xy: tuple[int, int] = (0, 0)) -> Mask:
+        """This window of a full-resolution 0/1 mask, moved by whole pixels, at reduced scale."""
+        dx, dy = shift_xy
+        h, w = mask.shape
+        part = np.zeros((self.height, self.width), np.uint8)
+        x0, y0 = max(self.x0, dx), max(self.y0, dy)
+        x1, y1 = min(self.x0 + self.width, w + dx), min(self.y0 + self.height, h + dy)
+        if x1 > x0 and y1 > y0:
+            source = mask[y0 - dy : y1 - dy, x0 - dx : x1 - dx]
+            part[y0 - self.y0 : y1 - self.y0, x0 - self.x0 : x1 - self.x0] = source * 255
+        size = (self.rgb.shape[1], self.rgb.shape[0])
+        return (cv2.resize(part, size, interpolation=cv2.INTER_AREA) > 127).astype(np.uint8)
+
+    def enlarge(self, mask: Mask) -> Mask:
+        """A reduced 0/1 mask at full resolution, this window only."""
+        return (cv2.resize(mask * 255, (self.width, self.height), interpolation=cv2.INTER_LINEAR) > 127).astype(
+            np.uint8
+        )
+
+
+class ClassicalSegmenter:
+    """See the module's text.
+
+    Args:
+        config: the whole configuration.
+        target: the CAD model, whose silhouettes tell what a mask can look like.
+    """
+
+    def __init__(self, config: HatConfig, target: Target) -> None:
+        self._config = config.segmentation.classical
+        self._renderer = create_renderer("embree", target)
+        self._bank = SilhouetteBank(target, self._renderer)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the previous mask."""
+        self._mask: Mask | None = None
+        self._velocity_xy = np.zeros(2)
+        self._since_check = 0
+        self._failures = 0
+        self._wait = 0
+
+    def update(self, frame: Frame, prior: PosePrior | None) -> Detection | None:
+        """Find the target in one frame; None rather than a wrong mask."""
+        mask = None
+        measured = sky.measure_sky(frame.rgb)
+        if measured.border_share >= self._config.sky_border_share:
+            mask = self._before_sky(measured, frame, prior)
+        else:
+            mask = self._before_texture(frame, prior)
+        self._remember(mask)
+        return None if mask is None else Detection(mask.astype(bool))
+
+    def _remember(self, mask: Mask | None) -> None:
+        if mask is None or not mask.any():
+            self._mask = None
+            self._velocity_xy = np.zeros(2)
+            return
+        if self._mask is not None and not sky.touches_border(mask) and not sky.touches_border(self._mask):
+            self._velocity_xy = _centroid(mask) - _centroid(self._mask)
+        self._mask = mask
+
+    # Black sky -------------------------------------------------------------------------------------------------
+
+    def _before_sky(self, measured: sky.Sky, frame: Frame, prior: PosePrior | None) -> Mask | None:
+        regions = sky.lit_regions(measured)
+        if not regions:
+            return None
+        sizes = np.array([np.count_nonzero(r) for r in regions])
+        main = 0
+        silhouette = self._silhouette(frame, prior)
+        if len(regions) > 1 and sizes[1] >= _SECOND_REGION_SHARE * sizes[0] or sky.touches_border(regions[0]):
+            main = self._choose_region(regions, sizes, silhouette)
+            if main is None:
+                return self._before_texture(frame, prior)
+        mask = sky.join_parts(regions, main)
+        if silhouette is not None and self._explains(silhouette, mask):
+            mask |= silhouette
+        return mask
+
+    def _choose_region(self, regions: list[Mask], sizes: NDArray[np.int64], silhouette: Mask | None) -> int | None:
+        """Which bright region is the target: the one that is where it was, or else the one with its shape."""
+        for known in (self._mask, silhouette):
+            if known is not None:
+                shared = np.array([np.count_nonzero(r & known) for r in regions])
+                if shared.max() >= 0.5 * sizes[np.argmax(shared)]:
+                    return int(np.argmax(shared))
+        shape = [self._bank.overlap(_shrink(r)) if s >= _SECOND_REGION_SHARE * sizes[0] else 0.0
+                 for r, s in zip(regions, sizes, strict=True)]  # fmt: skip
+        best = int(np.argmax(shape))
+        if sky.touches_border(regions[best]) and shape[best] < self._config.min_shape_overlap:
+            return None
+        return best
+
+    def _explains(self, silhouette: Mask, lit: Mask) -> bool:
+        """Whether nearly all that is lit lies inside the predicted silhouette, so that the rest of it is shadow."""
+        shared = np.count_nonzero(silhouette & lit)
+        return shared >= 0.95 * np.count_nonzero(lit) and shared >= 0.5 * np.count_nonzero(silhouette)
+
+    # Anything else ---------------------------------------------------------------------------------------------
+
+    def _before_texture(self, frame: Frame, prior: PosePrior | None) -> Mask | None:
+        if self._mask is not None:
+            tracked = self._track(frame, prior)
+            self._since_check += 1
+            if tracked is not None and self._since_check < self._config.check_interval_frames:
+                return tracked
+            if tracked is not None:
+                self._since_check = 0
+                return self._cross_check(frame, tracked)
+        if self._wait > 0:
+            self._wait -= 1
+            return None
+        found = self._search(frame, _SIDES)
+        if found is None:
+            self._failures += 1
+            self._wait = min(2**self._failures, _MAX_RETRY_FRAMES) - 1
+            return None
+        self._failures = 0
+        self._since_check = 0
+        return found[0]
+
+    def _track(self, frame: Frame, prior: PosePrior | None) -> Mask | None:
+        """Follow the previous mask into this frame, helped by the predicted silhouette while the two agree."""
+        assert self._mask is not None
+        dx, dy = (int(v) for v in np.rint(self._velocity_xy))
+        x, y, w, h = cv2.boundingRect(self._mask)
+        box = (x + dx, y + dy, x + w + dx, y + h + dy)
+        silhouette = self._silhouette(frame, prior)
+        if (
+            silhouette is not None
+            and _overlap(silhouette, _moved(self._mask, dx, dy)) >= self._config.min_prior_overlap
+        ):
+            u, v, a, b = cv2.boundingRect(silhouette)
+            box = (min(box[0], u), min(box[1], v), max(box[2], u + a), max(box[3], v + b))
+        else:
+            silhouette = None
+        margin = _MARGIN_PX + _MARGIN_SHARE * max(w, h)
+        window = self._window(frame, box, 2.5 * margin)
+        if window is None:
+            return None
+        seeds = [window.reduce(self._mask, (dx, dy))]
+        if silhouette is not None:
+            seeds.insert(0, window.reduce(silhouette))
+        cut = region.cut_from_seeds(window.rgb, seeds, margin * window.scale)
+        if cut is None:
+            return None
+        grown = np.count_nonzero(cut) / max(1, np.count_nonzero(seeds[-1]))
+        if not 1 / _MAX_AREA_CHANGE <= grown <= _MAX_AREA_CHANGE or _overlap(cut, seeds[0]) < _MIN_CONTINUITY:
+            return None
+        if region.edge_contrast(window.rgb, cut) < _MIN_CONTRAST:
+            return None
+        return self._finish(frame, window, cut)
+
+    def _cross_check(self, frame: Frame, tracked: Mask) -> Mask | None:
+        """Compare a tracked mask with what a search from nothing finds; keep the one that the CAD can explain."""
+        found = self._search(frame, _touched_sides(tracked))
+        if found is not None and _overlap(found[0], tracked) >= _AGREEMENT:
+            return tracked
+        shape = self._bank.overlap(_shrink(tracked))
+        if found is not None and found[1] > shape + _CLEARLY_BETTER:
+            return found[0]
+        return tracked if shape >= self._config.min_shape_overlap else None
+
+    def _search(self, frame: Frame, open_sides: tuple[str, ...]) -> tuple[Mask, float] | None:
+        """Find the target from nothing: the mask and its overlap with the nearest CAD silhouette."""
+        whole = self._window(frame, (0, 0, frame.camera.width, frame.camera.height), 0.0, self._config.cold_side_px)
+        if whole is None:
+            return None
+        best, best_shape = None, self._config.min_shape_overlap
+        for sides in ((), *((side,) for side in open_sides)):
+            cut = region.cut_from_nothing(whole.rgb, sides)
+            if cut is None or region.edge_contrast(whole.rgb, cut) < _MIN_CONTRAST:
+                continue
+            shape = self._bank.overlap(cut.astype(bool))
+            if shape >= best_shape + (_CLEARLY_BETTER if best is not None else 0.0):
+                best, best_shape = cut, shape
+        if best is None:
+            return None
+        mask = whole.enlarge(best)
+        x, y, w, h = cv2.boundingRect(mask)
+        margin = _MARGIN_PX + _MARGIN_SHARE * max(w, h)
+        window = self._window(frame, (x, y, x + w, y + h), 2.5 * margin)
+        if window is None:
+            return None
+        cut = region.cut_from_seeds(window.rgb, [window.reduce(mask)], margin * window.scale)
+        return None if cut is None else (self._finish(frame, window, cut), best_shape)
+
+    def _finish(self, frame: Frame, window: _Window, cut: Mask) -> Mask:
+        """Outline at full resolution, in a mask of the image's size."""
+        part = frame.rgb[window.y0 : window.y0 + window.height, window.x0 : window.x0 + window.width]
+        band = max(2, round(1 / window.scale) + 1)
+        fine = refine_outline(np.ascontiguousarray(part), window.enlarge(cut), band, _MIN_CONTRAST)
+        mask = np.zeros(frame.rgb.shape[:2], np.uint8)
+        mask[window.y0 : window.y0 + window.height, window.x0 : window.x0 + window.width] = fine
+        return mask
+
+    def _window(
+        self, frame: Frame, box: tuple[int, int, int, int], margin: float, side_px: int | None = None
+    ) -> _Window | None:
+        """The image around a box (x0, y0, x1, y1), reduced so that its longer side is at most ``side_px``."""
+        h, w = frame.rgb.shape[:2]
+        m = round(margin)
+        x0, y0, x1, y1 = max(0, box[0] - m), max(0, box[1] - m), min(w, box[2] + m), min(h, box[3] + m)
+        if x1 - x0 < 8 or y1 - y0 < 8:
+            return None
+        scale = min(1.0, (side_px or self._config.work_side_px) / max(x1 - x0, y1 - y0))
+        size = (max(4, round((x1 - x0) * scale)), max(4, round((y1 - y0) * scale)))
+        rgb = cv2.resize(frame.rgb[y0:y1, x0:x1], size, interpolation=cv2.INTER_AREA)
+        return _Window(x0, y0, x1 - x0, y1 - y0, scale, rgb)
+
+    def _silhouette(self, frame: Frame, prior: PosePrior | None) -> Mask | None:
+        """The predicted silhouette (H, W) of a healthy prior, None without one or when it is out of sight."""
+        if prior is None or not prior.healthy or not np.isfinite(prior.pose_row).all():
+            return None
+        camera = frame.camera
+        scale = min(1.0, 2 * self._config.work_side_px / max(camera.width, camera.height))
+        small = camera.crop(0, 0, camera.width, camera.height, scale)
+        mask = self._renderer.render(prior.T_cam_target, small, color=False).mask
+        if not mask.any():
+            return None
+        size = (camera.width, camera.height)
+        large = cv2.resize(mask.astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR)
+        return (large > 127).astype(np.uint8)
+
+
+def _shrink(mask: Mask, side_px: int = 128) -> NDArray[np.bool_]:
+    """A mask at reduced size, for comparing shapes."""
+    scale = min(1.0, side_px / max(mask.shape))
+    size = (max(1, round(mask.shape[1] * scale)), max(1, round(mask.shape[0] * scale)))
+    return cv2.resize(mask * 255, size, interpolation=cv2.INTER_AREA) > 127
+
+
+def _overlap(a: Mask, b: Mask) -> float:
+    union = np.count_nonzero(a | b)
+    return np.count_nonzero(a & b) / union if union else 0.0
+
+
+def _moved(mask: Mask, dx: int, dy: int) -> Mask:
+    """A mask moved by whole pixels, what leaves the image dropped."""
+    if dx == dy == 0:
+        return mask
+    out = np.zeros_like(mask)
+    h, w = mask.shape
+    x0, x1, y0, y1 = max(0, dx), min(w, w + dx), max(0, dy), min(h, h + dy)
+    if x1 > x0 and y1 > y0:
+        out[y0:y1, x0:x1] = mask[y0 - dy : y1 - dy, x0 - dx : x1 - dx]
+    return out
+
+
+def _centroid(mask: Mask) -> NDArray[np.float64]:
+    m = cv2.moments(mask, binaryImage=True)
+    return np.array([m["m10"], m["m01"]]) / m["m00"]
+
+
+def _touched_sides(mask: Mask) -> tuple[str, ...]:
+    touched = (mask[0].any(), mask[-1].any(), mask[:, 0].any(), mask[:, -1].any())
+    return tuple(side for side, touches in zip(_SIDES, touched, strict=True) if touches)

@@ -1,0 +1,103 @@
+"""A target before a textured, moving background: colour models of both sides and a graph cut between them.
+
+The cut is GrabCut (Rother, Kolmogorov, Blake, ACM Trans. Graphics 23, 2004) on a strongly reduced image, seeded by
+what is known; :mod:`hat_ros.segmentation.boundary` then finds the outline at full resolution.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hat_ros.segmentation.sky import fill_holes
+
+Mask = NDArray[np.uint8]
+
+_COLD_ITERATIONS = 3
+_RING_SHARE = 0.02  # width of the image border taken as background, of the longer side
+_PIECE_SHARE = 0.03  # pieces smaller than this share of the largest are not the target's
+_SIDES = ("top", "bottom", "left", "right")
+
+
+def graph_cut(rgb: NDArray[np.uint8], labels: Mask, iterations: int) -> Mask | None:
+    """(h, w) 0/1 mask from GrabCut labels (cv2.GC_*); None when one side is empty."""
+    foreground = int(np.count_nonzero(labels & 1))
+    if foreground < 8 or labels.size - foreground < 8:
+        return None
+    labels = labels.copy()
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    cv2.setRNGSeed(0)  # its k-means draws from OpenCV's global generator
+    cv2.grabCut(rgb, labels, None, models[0], models[1], iterations, cv2.GC_INIT_WITH_MASK)
+    return labels & 1
+
+
+def cut_from_seeds(rgb: NDArray[np.uint8], seeds: list[Mask], margin_px: float) -> Mask | None:
+    """Cut where seeds (0/1 masks of the same target) leave doubt.
+
+    What all seeds contain, ``margin_px`` from their outlines, is target; what is that far outside all of them is
+    background; the rest is decided by the image, starting from the first seed.
+    """
+    size = 2 * max(1, round(margin_px)) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    every = np.minimum.reduce(seeds)
+    some = np.maximum.reduce(seeds)
+    sure = cv2.erode(every, kernel, borderType=cv2.BORDER_REPLICATE)
+    maybe = cv2.dilate(some, kernel)
+    labels = np.where(maybe > 0, np.where(seeds[0] > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD), cv2.GC_BGD)
+    labels = np.where(sure > 0, cv2.GC_FGD, labels).astype(np.uint8)
+    cut = graph_cut(rgb, labels, 1)
+    return None if cut is None else tidy(cut, every)
+
+
+def cut_from_nothing(rgb: NDArray[np.uint8], open_sides: tuple[str, ...] = ()) -> Mask | None:
+    """Cut with the image border as the only example of background.
+
+    Args:
+        rgb: (h, w, 3) reduced image.
+        open_sides: of top, bottom, left, right: sides where the target may reach the border.
+    """
+    labels = np.full(rgb.shape[:2], cv2.GC_PR_FGD, np.uint8)
+    ring = max(2, round(_RING_SHARE * max(rgb.shape[:2])))
+    views = {
+        "top": lambda depth: labels[:depth],
+        "bottom": lambda depth: labels[-depth:],
+        "left": lambda depth: labels[:, :depth],
+        "right": lambda depth: labels[:, -depth:],
+    }
+    for side in _SIDES:
+        views[side](ring)[:] = cv2.GC_BGD
+    for side in open_sides:
+        views[side](3 * ring)[:] = cv2.GC_PR_FGD
+    cut = graph_cut(rgb, labels, _COLD_ITERATIONS)
+    return None if cut is None else tidy(cut, None)
+
+
+def tidy(mask: Mask, anchor: Mask | None) -> Mask | None:
+    """The largest piece (or those that touch the anchor) without holes; None when nothing is left."""
+    count, label, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
+    if count < 2:
+        return None
+    area = stats[:, cv2.CC_STAT_AREA].copy()
+    area[0] = 0
+    keep = area == area.max()
+    if anchor is not None:
+        touched = np.bincount(label[anchor > 0], minlength=count)
+        keep |= (touched > 0) & (area >= _PIECE_SHARE * area.max())
+    keep[0] = False
+    return fill_holes(keep.astype(np.uint8)[label], 0.05)
+
+
+def edge_contrast(rgb: NDArray[np.uint8], mask: Mask) -> float:
+    """Lower quartile of the colour step (8-bit) across the mask's outline inside the image; 0 without an outline."""
+    outer = cv2.dilate(mask, np.ones((3, 3), np.uint8))
+    inner = cv2.erode(mask, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
+    outline = (outer != inner).astype(np.uint8)
+    outline[0] = outline[-1] = 0
+    outline[:, 0] = outline[:, -1] = 0
+    rows, cols = np.nonzero(outline)
+    if rows.size < 8:
+        return 0.0
+    dx = cv2.Sobel(rgb, cv2.CV_32F, 1, 0, ksize=3)[rows, cols] / 4
+    dy = cv2.Sobel(rgb, cv2.CV_32F, 0, 1, ksize=3)[rows, cols] / 4
+    return float(np.percentile(np.sqrt((dx * dx + dy * dy).sum(axis=1)), 25))

@@ -1,0 +1,119 @@
+"""Is this mask an outline that the CAD model can have? Overlap with the nearest of its silhouettes.
+
+Each silhouette is resampled on a polar grid about its centroid, radii in units of its radius of gyration, so that
+position, range and in-plane rotation drop out: the last is a circular shift of the angle, searched for all angles at
+once by FFT. Where a mask is cut by the image border, what lies outside is unknown: it counts neither for nor against a
+silhouette, and the true centre and size are searched beyond the border.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from hat_ros import lie
+from hat_ros.render import Renderer
+from hat_ros.target import Target
+from hat_ros.types import Camera
+
+_SIDE_PX = 96  # side of the rendered silhouettes
+_RADII = 24
+_ANGLES = 64
+_EXTENT = 3.0  # largest radius of the grid, in radii of gyration; a rod seen from its end third stays inside
+_DISTANCE_RADII = 6.0  # range of the rendered views, in bounding radii: middle of what fills 5 to 50 % of an image
+_CUT_SHIFTS = (0.0, 0.25, 0.5, 0.75)  # of a cut mask: true centre beyond its own, in its radii of gyration
+_CUT_SCALES = (1.0, 1.2, 1.45)  # and true radius of gyration over its own
+
+
+class SilhouetteBank:
+    """Silhouettes of a target from all around.
+
+    Args:
+        target: the CAD model.
+        renderer: renders it.
+        subdivisions: of the icosahedron whose vertices are the view directions (2: 162 views).
+    """
+
+    def __init__(self, target: Target, renderer: Renderer, subdivisions: int = 2) -> None:
+        distance = _DISTANCE_RADII * target.bounding_radius_m
+        focal = 0.47 * _SIDE_PX * np.sqrt(_DISTANCE_RADII**2 - 1.0)
+        middle = (_SIDE_PX - 1) / 2
+        camera = Camera(np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]]), _SIDE_PX, _SIDE_PX)
+        polar = []
+        for direction in trimesh.creation.icosphere(subdivisions=subdivisions).vertices:
+            R = _looking_along(-np.asarray(direction))
+            T = lie.transform(R, np.array([0, 0, distance]) - R @ target.center_m)
+            mask = renderer.render(T, camera, color=False).mask
+            if mask.any():
+                center, radius = _moments(mask)
+                polar.append(_polar(mask.astype(np.uint8), center, radius))
+        radii = (np.arange(_RADII) + 0.5) * (_EXTENT / _RADII)
+        self._weight = (radii / radii.sum() / _ANGLES).astype(np.float32)  # area of a polar cell
+        views = np.stack(polar)
+        self._spectra = np.conj(np.fft.rfft(views, axis=-1) * self._weight[:, None]).astype(np.complex64)
+        self._areas = np.einsum("vra,r->v", views, self._weight)
+
+    def overlap(self, mask: NDArray[np.bool_]) -> float:
+        """Best intersection over union of an (H, W) mask with any silhouette, 0 to 1."""
+        if not mask.any():
+            return 0.0
+        image = mask.astype(np.uint8)
+        center, radius = _moments(mask)
+        outward = _cut_direction(mask)
+        if outward is None:
+            return self._overlap_at(_polar(image, center, radius), None)
+        inside = np.ones_like(image)
+        best = 0.0
+        for scale in _CUT_SCALES:
+            for shift in _CUT_SHIFTS:
+                at, size = center + shift * radius * outward, scale * radius
+                best = max(best, self._overlap_at(_polar(image, at, size), _polar(inside, at, size)))
+        return best
+
+    def _overlap_at(self, polar: NDArray[np.float32], known: NDArray[np.float32] | None) -> float:
+        spectrum = np.fft.rfft(polar, axis=-1).astype(np.complex64)
+        inter = np.fft.irfft(np.einsum("vrf,rf->vf", self._spectra, spectrum), n=_ANGLES, axis=-1)
+        area = float(polar.sum(axis=1) @ self._weight)
+        areas = self._areas[:, None]
+        if known is not None:
+            spectrum = np.fft.rfft(known, axis=-1).astype(np.complex64)
+            areas = np.fft.irfft(np.einsum("vrf,rf->vf", self._spectra, spectrum), n=_ANGLES, axis=-1)
+        return float((inter / np.maximum(areas + area - inter, 1e-9)).max())
+
+
+def _looking_along(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A rotation target -> camera whose optical axis has this direction in the target frame; the roll is arbitrary."""
+    helper = np.eye(3)[np.argmin(np.abs(direction))]
+    x = np.cross(helper, direction)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(direction, x), direction])
+
+
+def _moments(mask: NDArray[np.bool_]) -> tuple[NDArray[np.float64], float]:
+    """Centroid (x, y) and radius of gyration of a mask in pixels."""
+    m = cv2.moments(mask.astype(np.uint8), binaryImage=True)
+    center = np.array([m["m10"], m["m01"]]) / m["m00"]
+    return center, max(float(np.sqrt((m["mu20"] + m["mu02"]) / m["m00"])), 0.5)
+
+
+def _polar(image: NDArray[np.uint8], center: NDArray[np.float64], radius: float) -> NDArray[np.float32]:
+    """(radii, angles) samples of a binary image about a centre; 0 outside the image."""
+    r = (np.arange(_RADII) + 0.5) * (_EXTENT / _RADII * radius)
+    angle = np.arange(_ANGLES) * (2 * np.pi / _ANGLES)
+    x = (center[0] + r[:, None] * np.cos(angle)).astype(np.float32)
+    y = (center[1] + r[:, None] * np.sin(angle)).astype(np.float32)
+    return cv2.remap(image.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+
+
+def _cut_direction(mask: NDArray[np.bool_]) -> NDArray[np.float64] | None:
+    """Unit vector from the mask's middle towards where the image border cuts it, or None."""
+    h, w = mask.shape
+    weights = np.array([mask[:, 0].sum(), mask[:, -1].sum(), mask[0].sum(), mask[-1].sum()], dtype=np.float64)
+    if not weights.any():
+        return None
+    directions = np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
+    vector = weights @ directions
+    norm = np.linalg.norm(vector)
+    return vector / norm if norm > 0 else np.zeros(2)
