@@ -19,11 +19,6 @@ class Recording(Protocol):
     """One clip. The truth is for evaluation: no stage of the method may see it."""
 
     @property
-    def name(self) -> str:
-        """Name for tables."""
-        ...
-
-    @property
     def camera(self) -> Camera:
         """Calibration of all frames."""
         ...

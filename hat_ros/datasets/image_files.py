@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hat_ros import lie
-from hat_ros.errors import DatasetError
+from hat_ros.errors import DatasetError, FrameError
 from hat_ros.types import Camera, Frame
 
 # Sequences without a clock: 10 frames a second from one second on, so that no stamp is zero.
@@ -155,6 +155,35 @@ def pose_from_label(
     if abs(np.linalg.norm(q) - 1.0) > 0.01:
         raise DatasetError(f"{where}: quaternion has length {np.linalg.norm(q):.4f}, expected 1")
     return lie.transform(lie.matrix_from_quat(q[[1, 2, 3, 0]] if order == "wxyz" else q), t)
+
+
+def camera_from_label(K: object, size: Sequence[int], where: str) -> Camera:
+    """Camera of a data set that gives K and [width, height].
+
+    A principal point of exactly half the image size counts from the image corner (renderers do): it is moved by half
+    a pixel to our convention of integer pixel centres. Any other value comes from a calibration and is kept.
+
+    Raises:
+        DatasetError: not a camera matrix, or no image size.
+    """
+    try:
+        matrix = np.array(K, dtype=np.float64).reshape(3, 3)
+        width, height = (int(value) for value in size)
+        if matrix[0, 2] == width / 2 and matrix[1, 2] == height / 2:
+            matrix[:2, 2] -= 0.5
+        return Camera(matrix, width, height)
+    except (TypeError, ValueError, FrameError) as error:
+        raise DatasetError(f"{where}: camera matrix 3x3 and image size expected ({error})") from None
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) of an image file.
+
+    Raises:
+        DatasetError: missing or not an image.
+    """
+    height, width = _read(path, cv2.IMREAD_UNCHANGED).shape[:2]
+    return width, height
 
 
 def stamp_of(index: int) -> int:

@@ -12,6 +12,8 @@ no stamps; frames are 0.1 s apart.
 from __future__ import annotations
 
 import json
+from collections.abc import Collection, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -103,3 +105,16 @@ def _file(folder: Path, labels_path: Path, entry: Any, index: int) -> ImageFile:
         T_cam_target = pose_from_label(entry["q_wxyz_cam_from_target"], entry.get("t_cam_from_target_m"), "wxyz", where)
     mask = folder / "masks" / f"{Path(entry['file']).stem}.png"
     return ImageFile(stamp_of(index), image, T_cam_target, (mask,) if mask.is_file() else ())
+
+
+def open_sequences(
+    folder: Path, model: Path | None = None, sequences: Collection[str] = ()
+) -> Iterator[ImageRecording]:
+    """The one clip of a ``sequence`` folder, for the importer; ``model`` replaces its CAD model (same unit scale).
+
+    Raises:
+        DatasetError: see :func:`load_sequence`.
+    """
+    recording = load_sequence(folder)
+    if not sequences or recording.name in sequences:
+        yield recording if model is None else replace(recording, target_path=model)

@@ -1,0 +1,162 @@
+"""``hat import``: recordings of any known data set into bags, one per sequence, resumable; and a look at the labels."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Collection, Iterator
+from importlib import import_module
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hat_ros.bag import BagWriter
+from hat_ros.datasets.image_files import ImageFile, ImageRecording
+from hat_ros.errors import DatasetError, UsageError
+from hat_ros.render import create_renderer
+from hat_ros.target import load_target
+
+# name -> opener(root, model, sequences)
+FORMATS = {
+    "sequence": "hat_ros.datasets.sequence:open_sequences",
+    "spark": "hat_ros.datasets.spark:open_spark",
+    "shirt": "hat_ros.datasets.shirt:open_shirt",
+    "swisscube": "hat_ros.datasets.swisscube:open_swisscube",
+    "bop": "hat_ros.datasets.bop:open_bop",
+}
+
+Progress = Callable[[str, int, int], None]
+
+
+def open_dataset(
+    fmt: str, root: str | Path, model: str | Path | None = None, sequences: Collection[str] = ()
+) -> Iterator[ImageRecording]:
+    """Recordings of a data set in its own layout, without writing anything.
+
+    Args:
+        fmt: one of :data:`FORMATS`.
+        root: the data set's folder.
+        model: CAD model, for data sets that bring none.
+        sequences: names to keep, empty = all.
+
+    Raises:
+        UsageError: unknown format.
+        DatasetError: the folder does not have the layout, or a named sequence does not exist.
+    """
+    if fmt not in FORMATS:
+        raise UsageError(f"format '{fmt}' is not known, choose one of {', '.join(FORMATS)}")
+    root, model = Path(root), None if model is None else Path(model)
+    if not root.is_dir():
+        raise DatasetError(f"{root}: no such folder")
+    if model is not None and not model.is_file():
+        raise DatasetError(f"CAD model {model}: no such file")
+    module_name, function_name = FORMATS[fmt].split(":")
+    found = False
+    for recording in getattr(import_module(module_name), function_name)(root, model, sequences):
+        found = True
+        yield recording
+    if not found:
+        raise DatasetError(f"{root}: no sequence named {', '.join(sequences)}")
+
+
+def import_dataset(
+    fmt: str,
+    root: str | Path,
+    out: str | Path,
+    *,
+    model: str | Path | None = None,
+    sequences: Collection[str] = (),
+    check: bool = False,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Write bags: ``out`` itself for the ``sequence`` format, ``out/NAME`` per sequence otherwise.
+
+    Bags that are complete already are left alone, so an interrupted import goes on where it stopped.
+
+    Args:
+        fmt: see :func:`open_dataset`, as are ``root``, ``model`` and ``sequences``.
+        out: where to.
+        check: also write ``NAME.check.png`` beside each bag, see :func:`check_picture`.
+        progress: called with (sequence, frames done, frames in all).
+
+    Returns:
+        The bags, complete.
+
+    Raises:
+        UsageError, DatasetError, MeshError: see :func:`open_dataset` and ``load_target``.
+        RunError: the bag cannot be written.
+    """
+    out, bags = Path(out), []
+    for recording in open_dataset(fmt, root, model, sequences):
+        bag = out if fmt == "sequence" else out / recording.name
+        if not _complete(bag):
+            _write_bag(recording, bag, progress)
+        elif progress is not None:
+            progress(recording.name, len(recording), len(recording))
+        if check:
+            picture = check_picture(recording)
+            cv2.imwrite(str(bag.with_name(f"{bag.name}.check.png")), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+        bags.append(bag)
+    return bags
+
+
+def _complete(bag: Path) -> bool:
+    if (bag / "metadata.yaml").is_file():
+        return True
+    if bag.exists():
+        raise UsageError(f"{bag} exists and is not a bag; choose another --out or remove it")
+    return False
+
+
+def _write_bag(recording: ImageRecording, bag: Path, progress: Progress | None) -> None:
+    """Write beside the goal and rename, so that a bag under its own name is always complete."""
+    load_target(recording.target_path, recording.unit_scale)  # a bad CAD model is found before the long part
+    partial = bag.with_name(f"{bag.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    with BagWriter(partial / bag.name, image_format="png") as writer:
+        for index, item in enumerate(recording.files):
+            writer.write_frame(
+                item.stamp_ns,
+                _image(recording, item),
+                recording.camera,
+                mask=recording.given_mask(item),
+                T_cam_target=item.T_cam_target,
+            )
+            if progress is not None:
+                progress(recording.name, index + 1, len(recording))
+        writer.write_target(recording.target_path, recording.unit_scale, recording.name)
+    (partial / bag.name).rename(bag)
+    partial.rmdir()
+
+
+def _image(recording: ImageRecording, item: ImageFile) -> bytes | NDArray[np.uint8]:
+    """The file's own bytes where nothing has to change, else undistorted pixels (stored without loss)."""
+    frame = recording.frame(item)  # also proves that the file can be decoded and has the right size
+    if recording.distortion.any() or item.image.suffix.lower() not in (".jpg", ".jpeg", ".png"):
+        return frame.rgb
+    return item.image.read_bytes()
+
+
+def check_picture(recording: ImageRecording, width_px: int = 640) -> NDArray[np.uint8]:
+    """First, middle and last labelled frame with the CAD's outline at the true pose drawn in green: (H, W, 3) RGB.
+
+    Wrong units, quaternion order, frames or axes show at once: the outline misses the target.
+
+    Raises:
+        DatasetError: the recording has no truth.
+    """
+    labelled = [item for item in recording.files if item.T_cam_target is not None]
+    if not labelled:
+        raise DatasetError(f"{recording.name}: no frame has a true pose, nothing to check")
+    renderer = create_renderer("embree", load_target(recording.target_path, recording.unit_scale))
+    tiles = []
+    for item in (labelled[0], labelled[len(labelled) // 2], labelled[-1]):
+        rgb = recording.frame(item).rgb.copy()
+        silhouette = renderer.render(item.T_cam_target, recording.camera, color=False).mask.astype(np.uint8)
+        contours, _ = cv2.findContours(silhouette, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(rgb, contours, -1, (0, 255, 0), max(1, rgb.shape[1] // 640))
+        height_px = round(rgb.shape[0] * width_px / rgb.shape[1])
+        tiles.append(cv2.resize(rgb, (width_px, height_px), interpolation=cv2.INTER_AREA))
+    return np.concatenate(tiles, axis=1)
