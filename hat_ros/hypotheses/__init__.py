@@ -1,0 +1,1 @@
+"""Stage 2: scored pose hypotheses at keyframes."""

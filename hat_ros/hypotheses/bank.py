@@ -1,0 +1,221 @@
+"""The view bank of a CAD model: what its silhouette looks like from everywhere, in a form that is cheap to compare.
+
+Each view keeps its silhouette on a polar grid about its own centroid, scaled by its radius of gyration and Fourier
+transformed over the polar angle, so that turning the camera about its axis is a multiplication by a phase; and a
+sparse set of contour points in 3-D, from which a pose can be refined without rendering. Built once per model in about
+two seconds and kept in the platform's cache folder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hat_ros.refinement.contour import COL_WEIGHT, contour_table
+from hat_ros.render import Renderer
+from hat_ros.target import Target
+from hat_ros.types import Camera
+
+# Raised whenever the content of a bank changes its meaning: older cache files are then not found.
+_FORMAT = 1
+N_RINGS = 32
+# Outer radius of the polar grid in radii of gyration: the far end of a lopsided slender body lies at about 2.5.
+MAX_RADIUS = 2.6
+CONTOUR_POINTS = 96
+# Distance of the virtual camera in bounding radii: far enough that perspective matters little, near enough to be real.
+_DISTANCE_RADII = 8.0
+_RENDER_PX = 112
+_DIGEST_BYTES = 32
+
+
+@dataclass(frozen=True, eq=False)
+class ViewBank:
+    """Silhouettes of one target from V directions, F = n_angles // 2 + 1 Fourier coefficients, P contour points.
+
+    Attributes:
+        R_cam_target: (V, 3, 3) orientation of each view, the camera looking at the centre of the target.
+        spectrum: (F, V, rings) complex64 polar silhouettes, transformed over the angle.
+        area: (V,) area of the polar silhouette, in the unit of an inner product of two grids.
+        gyration: (V,) radius of gyration, tangent units at the view's distance.
+        centroid: (V, 2) silhouette centroid, tangent units, from the projected centre.
+        contour_m: (V, P, 3) contour points in the target frame.
+        contour_weight: (V, P) contour length each stands for, zero where unused.
+        distance_m: distance of the virtual camera from the centre.
+    """
+
+    R_cam_target: NDArray[np.float64]
+    spectrum: NDArray[np.complex64]
+    area: NDArray[np.float32]
+    gyration: NDArray[np.float64]
+    centroid: NDArray[np.float64]
+    contour_m: NDArray[np.float64]
+    contour_weight: NDArray[np.float64]
+    distance_m: float
+
+    @property
+    def n_angles(self) -> int:
+        """Number of in-plane angles."""
+        return 2 * (self.spectrum.shape[0] - 1)
+
+
+def load_or_build(target: Target, renderer: Renderer, n_views: int, n_angles: int) -> ViewBank:
+    """The bank of a target from the cache folder, built and stored there when absent, corrupt or of another format.
+
+    A cache that cannot be written is no error: the bank is then built again next time.
+    """
+    settings = f"{_FORMAT}:{n_views}:{n_angles}:{N_RINGS}:{MAX_RADIUS}:{CONTOUR_POINTS}:{_DISTANCE_RADII}:{_RENDER_PX}"
+    key = hashlib.sha256(f"{target.sha256}:{settings}".encode()).hexdigest()
+    path = cache_folder() / f"views-{key[:32]}.npz"
+    bank = _read(path, n_views, n_angles)
+    if bank is None:
+        bank = build(target, renderer, n_views, n_angles)
+        _write(path, bank)
+    return bank
+
+
+def cache_folder() -> Path:
+    """Where banks are kept: ``$XDG_CACHE_HOME/hat_ros``, by default ``~/.cache/hat_ros``."""
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(base) if os.path.isabs(base) else Path("~/.cache").expanduser()) / "hat_ros"
+
+
+def build(target: Target, renderer: Renderer, n_views: int, n_angles: int) -> ViewBank:
+    """Render every view and describe it. ``n_views``: an icosphere size (162, 642, 2562); ``n_angles`` even."""
+    rotations = view_rotations(n_views)
+    center, radius = target.center_m, target.bounding_radius_m
+    distance = _DISTANCE_RADII * radius
+    focal = 0.5 * (_RENDER_PX - 6) / np.tan(np.arcsin(1.0 / _DISTANCE_RADII))
+    K = np.array([[focal, 0, _RENDER_PX / 2 - 0.5], [0, focal, _RENDER_PX / 2 - 0.5], [0, 0, 1]])
+    camera = Camera(K, _RENDER_PX, _RENDER_PX)
+    rings = np.zeros((n_views, n_angles, N_RINGS), np.float32)
+    gyration, centroid = np.ones(n_views), np.zeros((n_views, 2))
+    contour, weight = np.zeros((n_views, CONTOUR_POINTS, 3)), np.zeros((n_views, CONTOUR_POINTS))
+    for i, R in enumerate(rotations):
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R, np.array([0, 0, distance]) - R @ center
+        view = renderer.render(T, camera, color=False)
+        if not view.mask.any():  # a flat body seen exactly edge-on
+            continue
+        center_px, gyration_px = mask_moments(view.mask)
+        rings[i] = polar_grid(view.mask.astype(np.float32), center_px, gyration_px, n_angles)
+        gyration[i] = gyration_px / focal
+        centroid[i] = (center_px - K[:2, 2]) / focal
+        table = contour_table(view.depth_m, view.mask, K, CONTOUR_POINTS)
+        contour[i, : len(table)] = (table[:, :3] - T[:3, 3]) @ R
+        weight[i, : len(table)] = table[:, COL_WEIGHT]
+    spectrum = np.ascontiguousarray(np.fft.rfft(rings, axis=1).transpose(1, 0, 2).astype(np.complex64))
+    area = (rings @ ring_weights()).sum(axis=1)
+    return ViewBank(rotations, spectrum, area, gyration, centroid, contour, weight, distance_m=float(distance))
+
+
+def mask_moments(mask: NDArray[np.bool_]) -> tuple[NDArray[np.float64], float]:
+    """Centroid (2,) and radius of gyration of a mask with at least one pixel, pixels."""
+    rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    x0, y0 = int(cols[0]), int(rows[0])
+    m = cv2.moments(np.ascontiguousarray(mask[y0 : rows[-1] + 1, x0 : cols[-1] + 1], np.uint8), binaryImage=True)
+    area = m["m00"]
+    # A pixel is a square, so even a single one has a radius of gyration: 1/12 of its side squared per axis.
+    spread = (m["mu20"] + m["mu02"]) / area + 1.0 / 6.0
+    return np.array([m["m10"] / area + x0, m["m01"] / area + y0]), float(np.sqrt(spread))
+
+
+def polar_grid(
+    image: NDArray[np.float32],
+    center_px: NDArray[np.float64],
+    gyration_px: float,
+    n_angles: int,
+    outside: float = 0.0,
+) -> NDArray[np.float32]:
+    """Sample an image on rings about a centre: (n_angles, rings), weighted so that a sum is an area.
+
+    Each sample carries the square root of its area, so that the inner product of two grids is an area of overlap and
+    both sides of the product are weighted alike.
+    """
+    angle = (np.arange(n_angles) * (2.0 * np.pi / n_angles))[:, None]
+    radius = ((np.arange(N_RINGS) + 0.5) * (MAX_RADIUS / N_RINGS))[None]
+    step_px = gyration_px * MAX_RADIUS / N_RINGS
+    if step_px > 2.0:  # average what lies between two samples
+        image = cv2.blur(image, (int(step_px), int(step_px)), borderType=cv2.BORDER_REPLICATE)
+    x = (center_px[0] + gyration_px * radius * np.cos(angle)).astype(np.float32)
+    y = (center_px[1] + gyration_px * radius * np.sin(angle)).astype(np.float32)
+    sampled = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=outside)
+    return sampled * ring_weights()
+
+
+def ring_weights() -> NDArray[np.float32]:
+    """(rings,) square root of the area of a sample on each ring, up to a common factor."""
+    return np.sqrt((np.arange(N_RINGS) + 0.5) * (MAX_RADIUS / N_RINGS)).astype(np.float32)
+
+
+def view_rotations(n_views: int) -> NDArray[np.float64]:
+    """(n_views, 3, 3) ``R_cam_target`` looking at the target from the vertices of a subdivided icosahedron."""
+    directions = _icosphere(n_views)  # from the target to the camera
+    z = -directions
+    helper = np.where(np.abs(z[:, 2:]) < 0.9, np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 1.0, 0.0]]))
+    x = np.cross(helper, z)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def _icosphere(n_vertices: int) -> NDArray[np.float64]:
+    """Unit vertices of an icosahedron whose edges are halved until it has ``10 * 4^n + 2`` vertices."""
+    g = (1.0 + np.sqrt(5.0)) / 2.0
+    vertices = [(-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g)]
+    vertices += [(0, -1, -g), (0, 1, -g), (g, 0, -1), (g, 0, 1), (-g, 0, -1), (-g, 0, 1)]
+    points = [np.array(v) / np.linalg.norm(v) for v in vertices]
+    faces = [(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6)]
+    faces += [(7, 1, 8), (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10)]
+    faces += [(8, 6, 7), (9, 8, 1)]
+    while len(points) < n_vertices:
+        middle: dict[tuple[int, int], int] = {}
+        finer = []
+        for face in faces:
+            mids = []
+            for a, b in zip(face, face[1:] + face[:1], strict=True):
+                edge = (min(a, b), max(a, b))
+                if edge not in middle:
+                    middle[edge] = len(points)
+                    sum_ab = points[a] + points[b]
+                    points.append(sum_ab / np.linalg.norm(sum_ab))
+                mids.append(middle[edge])
+            finer += [(face[i], mids[i], mids[i - 1]) for i in range(3)] + [tuple(mids)]
+        faces = finer
+    return np.array(points)
+
+
+def _write(path: Path, bank: ViewBank) -> None:
+    """Store a bank atomically: payload, then its SHA-256; silently not at all where the folder is not writable."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **vars(bank))
+    payload = buffer.getvalue()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".partial", delete=False) as file:
+            file.write(hashlib.sha256(payload).digest() + payload)
+        os.replace(file.name, path)
+    except OSError:
+        return
+
+
+def _read(path: Path, n_views: int, n_angles: int) -> ViewBank | None:
+    """The bank in a file, None when there is none or its bytes are not what was written."""
+    try:
+        data = path.read_bytes()
+    except OSError:
+        return None
+    digest, payload = data[:_DIGEST_BYTES], data[_DIGEST_BYTES:]
+    if hashlib.sha256(payload).digest() != digest:
+        return None
+    with np.load(io.BytesIO(payload), allow_pickle=False) as arrays:
+        fields = {name: arrays[name] for name in arrays.files}
+    fields["distance_m"] = float(fields["distance_m"])
+    bank = ViewBank(**fields)
+    return bank if bank.n_angles == n_angles and len(bank.area) == n_views else None

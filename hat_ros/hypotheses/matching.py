@@ -1,0 +1,176 @@
+"""Which views of the bank have the shape of a mask: all directions, in-plane angles, shifts and scales at once.
+
+The mask is laid on the bank's polar grid about an assumed centre and size. Overlap with every view at every in-plane
+angle is then one small complex matrix product per angular frequency and one inverse transform. A whole mask has one
+such assumption, its own centroid and radius of gyration; a mask that is cut by the image border or lacks dark parts
+has several, and all go through the same product.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hat_ros import lie
+from hat_ros.hypotheses.bank import ViewBank, mask_moments, polar_grid, ring_weights
+from hat_ros.types import Camera
+
+# What silhouette without mask costs, against mask without silhouette = 1. A part that lies in shadow or outside the
+# detector's reach is missing from the mask; mask where there is no target is rarer.
+MISSING_WEIGHT = 0.5
+
+
+@dataclass(frozen=True)
+class Placement:
+    """An assumption about the whole silhouette: its centroid and radius of gyration in pixels."""
+
+    center_px: NDArray[np.float64]
+    gyration_px: float
+
+
+@dataclass(frozen=True)
+class ShapeMatches:
+    """Coarse poses, best first: T_cam_target (N, 4, 4), view index (N,), shape score (N,) in 0..1."""
+
+    T_cam_target: NDArray[np.float64]
+    view: NDArray[np.intp]
+    score: NDArray[np.float64]
+
+
+def whole_placement(mask: NDArray[np.bool_]) -> list[Placement]:
+    """The mask taken as the whole silhouette."""
+    return [Placement(*mask_moments(mask))]
+
+
+def cut_placements(mask: NDArray[np.bool_]) -> list[Placement]:
+    """The mask continues beyond the image border: centroids further out, larger sizes."""
+    center, gyration = mask_moments(mask)
+    outward = np.zeros(2)
+    for pixels, direction in (
+        (mask[0], (0, -1)),
+        (mask[-1], (0, 1)),
+        (mask[:, 0], (-1, 0)),
+        (mask[:, -1], (1, 0)),
+    ):
+        outward += np.count_nonzero(pixels) * np.array(direction, dtype=np.float64)
+    length = np.linalg.norm(outward)
+    outward = outward / length if length > 0 else outward
+    return [
+        Placement(center + shift * gyration * outward, scale * gyration)
+        for shift, scale in ((0.0, 1.15), (0.4, 1.15), (0.4, 1.4), (0.9, 1.4), (0.9, 1.8), (1.5, 1.8), (1.5, 2.4))
+    ]
+
+
+def partial_placements(mask: NDArray[np.bool_]) -> list[Placement]:
+    """Parts of the target are missing from the mask on an unknown side."""
+    center, gyration = mask_moments(mask)
+    angles = np.arange(8) * (np.pi / 4)
+    return [Placement(center, 1.3 * gyration)] + [
+        Placement(center + shift * gyration * np.array([np.cos(a), np.sin(a)]), scale * gyration)
+        for shift, scale in ((0.5, 1.25), (0.9, 1.6))
+        for a in angles
+    ]
+
+
+def match_shape(
+    bank: ViewBank,
+    mask: NDArray[np.bool_],
+    placements: list[Placement],
+    camera: Camera,
+    n_best: int,
+    separation_deg: float,
+    center_m: NDArray[np.float64],
+) -> ShapeMatches:
+    """The best matches whose orientations differ by at least ``separation_deg``.
+
+    Args:
+        bank: the target's views.
+        mask: (H, W) bool.
+        placements: assumptions about centre and size, at least one.
+        camera: intrinsics of the image.
+        n_best: at most this many.
+        separation_deg: smallest angle between two of them.
+        center_m: (3,) centre of the target's box, which the bank's camera looks at.
+    """
+    score = _scores(bank, mask, placements)
+    n_placements, n_views, n_angles = score.shape
+    flat = score.ravel()
+    n_sorted = min(flat.size, 4096)
+    order = np.argpartition(-flat, n_sorted - 1)[:n_sorted]
+    order = order[np.lexsort((order, -flat[order]))]
+    placement, view, angle = np.unravel_index(order, score.shape)
+    del n_placements, n_views
+    T = _poses(bank, placements, placement, view, angle * (2.0 * np.pi / n_angles), camera, center_m)
+    keep = distinct(T[:, :3, :3], n_best, np.radians(separation_deg))
+    return ShapeMatches(T[keep], view[keep], flat[order][keep].astype(np.float64))
+
+
+def distinct(R: NDArray[np.float64], n_best: int, separation_rad: float) -> NDArray[np.intp]:
+    """Indices of rotations (N, 3, 3), in order, each at least so far from all before it."""
+    quats = lie.quat_from_matrix(R)
+    limit = np.cos(0.5 * separation_rad)
+    free = np.ones(len(quats), dtype=bool)
+    keep: list[int] = []
+    for i in range(len(quats)):
+        if free[i]:
+            keep.append(i)
+            if len(keep) == n_best:
+                break
+            free &= np.abs(quats @ quats[i]) < limit
+    return np.array(keep, dtype=np.intp)
+
+
+def _scores(bank: ViewBank, mask: NDArray[np.bool_], placements: list[Placement]) -> NDArray[np.float32]:
+    """Tversky overlap (placements, views, angles) between mask and view, over what lies inside the image."""
+    image = mask.astype(np.float32)
+    n_angles = bank.n_angles
+    grids = np.stack([polar_grid(image, p.center_px, p.gyration_px, n_angles) for p in placements])
+    inside = np.stack([polar_grid(np.ones_like(image), p.center_px, p.gyration_px, n_angles) for p in placements])
+    overlap = _correlate(bank, grids)
+    full = inside.min() > 0  # nothing of any grid lies outside the image
+    silhouette = bank.area[None, :, None] if full else _correlate(bank, inside)
+    # Both grids carry the root of the sample's area; that of a mask against ones carries it once more.
+    mask_area = (grids @ ring_weights()).sum(axis=1)[:, None, None]
+    union = overlap + (mask_area - overlap) + MISSING_WEIGHT * (silhouette - overlap)
+    return overlap / np.maximum(union, 1e-6)
+
+
+def _correlate(bank: ViewBank, grids: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Inner products of grids (P, angles, rings) with every view turned by every angle: (P, V, angles)."""
+    spectrum = np.fft.rfft(grids, axis=1).astype(np.complex64)
+    product = np.matmul(np.conj(bank.spectrum), spectrum.transpose(1, 2, 0))  # (F, V, P)
+    return np.fft.irfft(product.transpose(2, 1, 0), n=bank.n_angles, axis=2).astype(np.float32)
+
+
+def _poses(
+    bank: ViewBank,
+    placements: list[Placement],
+    placement: NDArray[np.intp],
+    view: NDArray[np.intp],
+    angle_rad: NDArray[np.float64],
+    camera: Camera,
+    center_m: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Poses that put each view's silhouette, turned by its angle, on its placement: (N, 4, 4)."""
+    K = camera.K
+    focal = np.sqrt(K[0, 0] * K[1, 1])
+    gyration = np.array([p.gyration_px for p in placements])[placement] / focal
+    center = np.array([p.center_px for p in placements])[placement]
+    scale = gyration / bank.gyration[view]
+    depth = bank.distance_m / scale
+    zeros, ones = np.zeros(len(view)), np.ones(len(view))
+    roll = lie.so3_exp(np.stack([zeros, zeros, angle_rad], axis=1))
+    offset = np.einsum("nij,nj->ni", roll[:, :2, :2], bank.centroid[view]) * scale[:, None]
+    y = (center[:, 1] - K[1, 2]) / K[1, 1] - offset[:, 1]
+    x = (center[:, 0] - K[0, 2] - K[0, 1] * (center[:, 1] - K[1, 2]) / K[1, 1]) / K[0, 0] - offset[:, 0]
+    ray = np.stack([x, y, ones], axis=1)
+    # The bank's camera looks straight at the target: turn it from the optical axis to the ray.
+    axis = np.stack([-y, x, zeros], axis=1)
+    sine = np.linalg.norm(axis, axis=1)
+    turn = axis * (np.arctan(sine) / np.where(sine > 1e-12, sine, 1.0))[:, None]
+    R = lie.so3_exp(turn) @ roll @ bank.R_cam_target[view]
+    # Depth is measured along the ray, as the bank's distance is.
+    position = ray / np.linalg.norm(ray, axis=1, keepdims=True) * depth[:, None]
+    return lie.transform(R, position - R @ center_m)

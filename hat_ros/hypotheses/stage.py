@@ -1,0 +1,44 @@
+"""Stage 2 as the tracker and the node see it: one backend, asked at keyframes only, its answer checked."""
+
+from __future__ import annotations
+
+from hat_ros.config import HatConfig
+from hat_ros.core.guard import guard_candidates
+from hat_ros.core.keyframes import KeyframeSchedule
+from hat_ros.stages import create_backend
+from hat_ros.target import Target
+from hat_ros.types import Candidates, Detection, Frame, PosePrior
+
+
+class HypothesisStage:
+    """Generates candidates at anchor opportunities (paper, Stage 2).
+
+    Args:
+        config: the whole configuration; ``hypotheses.backend`` names the backend.
+        target: the CAD model.
+    """
+
+    def __init__(self, config: HatConfig, target: Target) -> None:
+        self._max_candidates = config.hypotheses.max_candidates
+        self._drop_implausible = config.hypotheses.guard
+        self._schedule = KeyframeSchedule(config.keyframes)
+        self._backend = create_backend("hypotheses", config, target)
+
+    def update(self, frame: Frame, detection: Detection | None, prior: PosePrior | None) -> Candidates:
+        """Candidates of one frame, best first; zero rows between keyframes and without a detection.
+
+        Raises:
+            CandidateError: the backend returned a score or pose that is not finite and ``hypotheses.guard`` is off.
+        """
+        if not self._schedule.update(detection is not None) or detection is None:
+            return Candidates.none()
+        candidates = self._backend.generate(frame, detection, prior)
+        if len(candidates) > self._max_candidates:
+            keep = slice(self._max_candidates)
+            candidates = Candidates(candidates.pose_rows[keep], candidates.log_score[keep], candidates.box_xyxy)
+        return guard_candidates(candidates, self._drop_implausible)
+
+    def reset(self) -> None:
+        """Forget earlier frames; the next frame with a detection is a keyframe."""
+        self._schedule.reset()
+        self._backend.reset()

@@ -1,0 +1,66 @@
+"""Refines each fused pose on the current image, and says how far to trust it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hat_ros import lie
+from hat_ros.config import RefinementConfig
+from hat_ros.refinement.covariance import pose_covariance
+from hat_ros.refinement.refiner import WITH_MASK, WITHOUT_MASK, PoseFitter
+from hat_ros.refinement.view import MaskField, TargetViewer
+from hat_ros.target import Target
+from hat_ros.types import Detection, Frame, Refined
+
+
+class FusedPoseRefiner:
+    """Contour refinement of one pose per frame; uses nothing but the present frame.
+
+    Args:
+        config: the ``refinement`` section.
+        target: the CAD model.
+    """
+
+    def __init__(self, config: RefinementConfig, target: Target) -> None:
+        self._config = config
+        self._target = target
+        self._viewer = TargetViewer(target)
+        self._fitter = PoseFitter(self._viewer, config.render_px, config.max_points)
+
+    def refine(self, frame: Frame, detection: Detection | None, T_cam_target: NDArray[np.float64]) -> Refined | None:
+        """Refine a pose within its basin.
+
+        Args:
+            frame: the current image.
+            detection: its mask, None when there is none (the image's edges alone are used then).
+            T_cam_target: (4, 4) fused pose.
+
+        Returns:
+            The refined pose with its uncertainty, or None when the target is out of view, nothing in the image can be
+            measured, or the refinement would leave the basin.
+        """
+        field = MaskField(detection.mask) if detection is not None and detection.silhouette else None
+        rounds = WITHOUT_MASK if field is None else WITH_MASK
+        fit = self._fitter.fit(T_cam_target, frame.camera, frame.rgb, field, rounds)
+        if fit is None or not self._same_basin(T_cam_target, fit.T_cam_target):
+            return None
+        covariance = pose_covariance(fit, self._target.bounding_radius_m)
+        view = self._viewer.view(fit.T_cam_target, frame.camera, self._config.render_px)
+        if covariance is None or view is None:
+            return None
+        overlap = float("nan")
+        if field is not None:
+            common, extra, missing = field.compare(view)
+            overlap = common / max(common + extra + missing, 1e-9)
+        return Refined(lie.row_from_matrix(fit.T_cam_target), covariance, overlap, fit.support)
+
+    def reset(self) -> None:
+        """Nothing to forget: every frame stands for itself."""
+
+    def _same_basin(self, T_before: NDArray[np.float64], T_after: NDArray[np.float64]) -> bool:
+        turn = np.degrees(lie.angle_between(T_before[:3, :3], T_after[:3, :3]))
+        center_before = T_before[:3, :3] @ self._target.center_m + T_before[:3, 3]
+        center_after = T_after[:3, :3] @ self._target.center_m + T_after[:3, 3]
+        shift = np.linalg.norm(center_after - center_before) / np.linalg.norm(center_before)
+        return bool(turn <= self._config.max_rotation_deg and shift <= self._config.max_shift)

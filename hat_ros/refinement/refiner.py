@@ -1,0 +1,143 @@
+"""Refinement of one pose on one image: contour against mask and edges, re-rendered as the pose moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hat_ros import lie
+from hat_ros.refinement.solver import fit_contour
+from hat_ros.refinement.view import MaskField, TargetViewer, contour_lines
+from hat_ros.types import Camera, Frame
+
+_NO_DISTANCE = np.zeros((2, 2), np.float32)
+_NO_ORIGIN = np.zeros(2)
+# A contour point agrees with the image when its edge or the mask's boundary lies this close, pixels.
+_AGREE_PX = 2.5
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Per iteration of one round: reach of the lines, robust scales of edges and mask; pixels, 0 = unused."""
+
+    reach: tuple[float, ...]
+    edge: tuple[float, ...]
+    mask: tuple[float, ...]
+
+
+# The mask leads the way, then the image's own edges take over; without a mask long lines lead the way.
+WITH_MASK = (
+    Schedule((0, 0, 0, 0), (1, 1, 1, 1), (12, 8, 5, 4)),
+    Schedule((0, 0, 4, 4), (1, 1, 2, 2), (4, 3, 2, 2)),
+    Schedule((4, 3.5, 3), (1.5, 1.5, 1.5), (1.5, 1.5, 1.5)),
+)
+WITHOUT_MASK = (
+    Schedule((16, 16, 12, 12), (8, 8, 6, 6), (0, 0, 0, 0)),
+    Schedule((8, 8, 6, 6), (4, 4, 3, 3), (0, 0, 0, 0)),
+    Schedule((4, 3.5, 3), (1.5, 1.5, 1.5), (0, 0, 0)),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A refined pose and the evidence for it.
+
+    Attributes:
+        T_cam_target: (4, 4).
+        information: (6, 6) of ``[dt; r]``, one pixel of contour counted as one independent sample.
+        contour: (N, 5) as returned by the solver.
+        lines: (N, 5) of the contour it belongs to.
+        view: the rendering at the end (None if it was not rendered).
+    """
+
+    T_cam_target: NDArray[np.float64]
+    information: NDArray[np.float64]
+    contour: NDArray[np.float64]
+    lines: NDArray[np.float64]
+
+    @property
+    def support(self) -> float:
+        """Share of the contour inside the image that agrees with an edge or the mask's boundary."""
+        inside = self.contour[:, 0] > 0
+        length = self.lines[:, 2]
+        total = length[inside].sum()
+        if total <= 0:
+            return 0.0
+        edge = (self.contour[:, 4] > 0) & (np.abs(self.contour[:, 3]) < _AGREE_PX)
+        mask = (self.contour[:, 2] > 0) & (np.abs(self.contour[:, 1]) < _AGREE_PX)
+        return float(length[inside & (edge | mask)].sum() / total)
+
+
+class PoseFitter:
+    """Runs rounds of render, contour, iterations."""
+
+    def __init__(self, viewer: TargetViewer, render_px: int, max_points: int) -> None:
+        self.viewer = viewer
+        self._render_px = render_px
+        self._max_points = max_points
+
+    def fit(
+        self,
+        T_cam_target: NDArray[np.float64],
+        camera: Camera,
+        image: NDArray[np.uint8],
+        field: MaskField | None,
+        rounds: tuple[Schedule, ...],
+    ) -> Fit | None:
+        """Refine; None when the target leaves the view on the way."""
+        T = T_cam_target
+        fit = None
+        for schedule in rounds:
+            view = self.viewer.view(T, camera, self._render_px)
+            if view is None:
+                return None
+            lines = contour_lines(view, T, self._max_points)
+            fit = self._iterate(T, lines, camera, image, field, schedule)
+            T = fit.T_cam_target
+        return fit
+
+    def pull(
+        self,
+        T_cam_target: NDArray[np.float64],
+        points_m: NDArray[np.float64],
+        lines: NDArray[np.float64],
+        frame: Frame,
+        field: MaskField,
+        scales_px: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Pull given contour points onto the mask's boundary, without rendering: the (4, 4) pose."""
+        off = np.zeros(len(scales_px))
+        R, t, _, _ = fit_contour(
+            points_m,
+            lines,
+            np.ascontiguousarray(T_cam_target[:3, :3]),
+            np.ascontiguousarray(T_cam_target[:3, 3]),
+            frame.camera.K,
+            frame.rgb,
+            off,
+            field.distance,
+            field.origin_px,
+            scales_px,
+            off,
+            self.viewer.target.bounding_radius_m,
+        )
+        return lie.transform(R, t)
+
+    def _iterate(self, T, lines, camera, image, field, schedule: Schedule) -> Fit:
+        R, t, H, contour = fit_contour(
+            lines.points_m,
+            lines.lines,
+            np.ascontiguousarray(T[:3, :3]),
+            np.ascontiguousarray(T[:3, 3]),
+            camera.K,
+            image,
+            np.array(schedule.reach, dtype=np.float64),
+            _NO_DISTANCE if field is None else field.distance,
+            _NO_ORIGIN if field is None else field.origin_px,
+            np.array(schedule.mask, dtype=np.float64),
+            np.array(schedule.edge, dtype=np.float64),
+            self.viewer.target.bounding_radius_m,
+        )
+        return Fit(lie.transform(R, t), H, contour, lines.lines)

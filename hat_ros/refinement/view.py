@@ -1,0 +1,160 @@
+"""What the image should show at a pose, and what the detection says: the two sides that refinement compares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from hat_ros.refinement.contour import (
+    COL_INSIDE,
+    COL_NU,
+    COL_NV,
+    COL_OUTSIDE,
+    COL_WEIGHT,
+    contour_table,
+)
+from hat_ros.render import Rendering, create_renderer
+from hat_ros.target import Target
+from hat_ros.types import Camera
+
+# Margin of the rendered crop around the target, in crop pixels: the contour needs background on both sides.
+_CROP_MARGIN_PX = 4
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A rendered crop that holds the whole target, at its own resolution.
+
+    Attributes:
+        rendering: the crop.
+        camera: its intrinsics.
+        origin_px: (2,) image position of the crop's pixel (0, 0).
+        scale: crop pixels per image pixel.
+    """
+
+    rendering: Rendering
+    camera: Camera
+    origin_px: NDArray[np.float64]
+    scale: float
+
+    def resample(self, image: NDArray[np.generic]) -> NDArray[np.generic]:
+        """A single-channel image seen through this crop; 0 beyond its border."""
+        affine = np.array([[1 / self.scale, 0, self.origin_px[0]], [0, 1 / self.scale, self.origin_px[1]]])
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        return cv2.warpAffine(image, affine, (self.camera.width, self.camera.height), flags=flags)
+
+
+class TargetViewer:
+    """Renders views of one target for refinement and scoring."""
+
+    def __init__(self, target: Target) -> None:
+        self.target = target
+        self.renderer = create_renderer("embree", target)
+        try:
+            self._hull_m = target.vertices_m[ConvexHull(target.vertices_m).vertices]
+        except QhullError:  # a flat model
+            self._hull_m = target.vertices_m
+
+    def view(self, T_cam_target: NDArray[np.float64], camera: Camera, side_px: int, color: bool = False) -> View | None:
+        """The target at a pose, its longer side ``side_px`` crop pixels; None when it reaches behind the camera."""
+        points = self._hull_m @ T_cam_target[:3, :3].T + T_cam_target[:3, 3]
+        if not np.isfinite(points).all() or points[:, 2].min() <= 1e-3 * self.target.bounding_radius_m:
+            return None
+        uv = camera.project(points)
+        low, high = uv.min(axis=0), uv.max(axis=0)
+        scale = (side_px - 2 * _CROP_MARGIN_PX) / max(float((high - low).max()), 1e-3)
+        if not 1e-3 < scale < 1e3:
+            return None
+        origin = low - _CROP_MARGIN_PX / scale
+        width, height = np.ceil((high - origin) * scale).astype(int) + _CROP_MARGIN_PX
+        K = camera.K.copy()
+        K[:2, 2] -= origin
+        K[:2] *= scale
+        crop = Camera(K, int(width), int(height))
+        return View(self.renderer.render(T_cam_target, crop, color=color), crop, origin, scale)
+
+
+@dataclass(frozen=True, eq=False)
+class ContourLines:
+    """The contour of a view as the solver wants it.
+
+    Attributes:
+        points_m: (N, 3) in the target frame.
+        lines: (N, 5) outward normal (2), contour length it stands for, free distance inwards and outwards; pixels of
+            the image.
+    """
+
+    points_m: NDArray[np.float64]
+    lines: NDArray[np.float64]
+
+
+def contour_lines(view: View, T_cam_target: NDArray[np.float64], max_points: int) -> ContourLines:
+    """Sample the contour of a view."""
+    table = contour_table(view.rendering.depth_m, view.rendering.mask, view.camera.K, max_points)
+    points = (table[:, :3] - T_cam_target[:3, 3]) @ T_cam_target[:3, :3]
+    lines = table[:, [COL_NU, COL_NV, COL_WEIGHT, COL_INSIDE, COL_OUTSIDE]]
+    lines[:, 2:] /= view.scale
+    return ContourLines(points, lines)
+
+
+class MaskField:
+    """A mask as a signed distance, on the crop that matters.
+
+    Args:
+        mask: (H, W) bool with at least one pixel set.
+    """
+
+    def __init__(self, mask: NDArray[np.bool_]) -> None:
+        self.mask = mask
+        rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        self.size_px = float(max(np.ptp(rows), np.ptp(cols)) + 1)
+        margin = int(max(24, 0.35 * self.size_px))
+        # Beyond the image border nothing is known: the border pixels continue, so that a cut is no contour.
+        height, width = mask.shape
+        y0, y1 = max(rows[0] - margin, -margin), min(rows[-1] + 1 + margin, height + margin)
+        x0, x1 = max(cols[0] - margin, -margin), min(cols[-1] + 1 + margin, width + margin)
+        self.origin_px = np.array([x0, y0], dtype=np.float64)
+        iy = np.clip(np.arange(y0, y1), 0, height - 1)
+        ix = np.clip(np.arange(x0, x1), 0, width - 1)
+        crop = mask[np.ix_(iy, ix)].astype(np.uint8)
+        # A boundary lies half a pixel from the centres on either side of it.
+        outside = cv2.distanceTransform(1 - crop, cv2.DIST_L2, 5) - 0.5
+        inside = cv2.distanceTransform(crop, cv2.DIST_L2, 5) - 0.5 if not crop.all() else np.full_like(outside, 1e3)
+        distance = np.where(crop > 0, -inside, outside).astype(np.float32)
+        self.distance = cv2.GaussianBlur(distance, (0, 0), 1.0)
+
+    @cached_property
+    def float_mask(self) -> NDArray[np.float32]:
+        """(H, W) float32 mask, 0 or 1."""
+        return self.mask.astype(np.float32)
+
+    @cached_property
+    def _ones(self) -> NDArray[np.float32]:
+        return np.ones(self.mask.shape, np.float32)
+
+    @cached_property
+    def area_px(self) -> float:
+        """Mask pixels."""
+        return float(np.count_nonzero(self.mask))
+
+    def compare(self, view: View) -> tuple[float, float, float]:
+        """Areas in image pixels, inside the image only: common, mask without silhouette, silhouette without mask."""
+        seen = view.resample(self.float_mask)
+        silhouette = view.rendering.mask
+        if (
+            view.origin_px.min() < 0
+            or (
+                np.array([view.camera.width, view.camera.height]) / view.scale + view.origin_px
+                > np.array(self.mask.shape[::-1]) - 1
+            ).any()
+        ):
+            silhouette = silhouette & (view.resample(self._ones) > 0.5)
+        unit = 1.0 / view.scale**2
+        common = float(np.minimum(seen, silhouette).sum()) * unit
+        missing = float(np.count_nonzero(silhouette)) * unit - common
+        return common, max(self.area_px - common, 0.0), max(missing, 0.0)
