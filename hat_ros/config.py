@@ -74,7 +74,11 @@ class SegmentationConfig:
 class TemplateConfig:
     """Training-free hypotheses: view bank and refinement."""
 
-    n_views: int = option(642, "view directions on the sphere (icosphere sizes: 162, 642, 2562)")
+    n_views: int = option(642, "view directions on the sphere: 162, 642 or 2562", low=162, high=2562)
+    n_angles: int = option(72, "in-plane angles compared for each view", low=24, high=360)
+    n_coarse: int = option(24, "distinct shape matches that are refined", low=1, high=256)
+    separation_deg: float = option(15.0, "candidates closer than this are one basin", low=1, high=90)
+    render_px: int = option(96, "longer side of the views rendered for refinement and scoring", low=48, high=512)
 
 
 @dataclass(frozen=True)
@@ -175,6 +179,10 @@ class RefinementConfig:
     """Refinement of every fused pose on its own image (the paper's dense refinement, causal)."""
 
     enabled: bool = option(False, "refine the fused pose on the current image")
+    render_px: int = option(160, "longer side of the views rendered for the contour", low=48, high=512)
+    max_points: int = option(300, "contour points used", low=50, high=5000)
+    max_rotation_deg: float = option(12.0, "a refinement that turns further left its basin: refused", low=0, high=180)
+    max_shift: float = option(0.15, "and so is one that moves further, as a share of the range", low=0, high=1)
 
 
 @dataclass(frozen=True)
