@@ -31,6 +31,9 @@ _NO_COVARIANCE = np.full((6, 6), np.nan)
 class Method(Protocol):
     """What turns frames into poses."""
 
+    causal: bool
+    """Whether ``step`` gives the final answer; if not, :meth:`finish` does."""
+
     stages: dict[str, Any]
     """Stage name -> the object whose ``update`` is that stage; for timing."""
 
@@ -39,7 +42,7 @@ class Method(Protocol):
         ...
 
     def finish(self) -> list[Estimate]:
-        """Estimates that replace those of the steps; empty for a causal method."""
+        """The estimates of all frames, for a method that is not causal; empty otherwise."""
         ...
 
 
@@ -59,6 +62,8 @@ def create_method(mode: str, config: HatConfig, target: Target) -> Method:
 class Hat:
     """The method of the paper, as :class:`HatTracker` runs it."""
 
+    causal = True
+
     def __init__(self, config: HatConfig, target: Target) -> None:
         self._tracker = HatTracker(config, target)
         self.stages = {
@@ -77,6 +82,8 @@ class Hat:
 
 class Independent:
     """Every frame for itself: its best-scored hypothesis, or no pose."""
+
+    causal = True
 
     def __init__(self, config: HatConfig, target: Target) -> None:
         config = replace(config, keyframes=replace(config.keyframes, gap_frames=1))

@@ -14,15 +14,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from hat_ros import lie
+from hat_ros.bag import BagReader, deserialize
 from hat_ros.datasets import Recording
 from hat_ros.datasets.sequence import load_sequence
-from hat_ros.errors import UsageError
+from hat_ros.errors import BagError, FrameError, UsageError
 from hat_ros.evaluation.metrics import mask_iou
 from hat_ros.methods import Method
+from hat_ros.nodes.images import decode_image, decode_mask
 from hat_ros.target import Target, load_target
 from hat_ros.tracker import Step
-from hat_ros.types import Estimate, Frame
+from hat_ros.types import Frame
 
 STAGE_NAMES = ("segmentation", "hypotheses", "motion", "selector", "fusion")
 MEASURED = ("latency_ms", "decode_ms", *(f"{name}_ms" for name in STAGE_NAMES), "mask_iou")
@@ -109,20 +113,27 @@ class Pipeline:
         self._clock = StageClock(method)
         self.admission = Admission()
 
-    def run(self, frames: Iterable[Frame]) -> Iterator[Processed]:
-        """Process frames in order; rejected ones are counted in ``admission``."""
+    @property
+    def causal(self) -> bool:
+        """Whether every step is final."""
+        return self._method.causal
+
+    def run(self, frames: Iterable[Frame | FrameError]) -> Iterator[Processed]:
+        """Process frames in order; rejected ones (late stamp, malformed) are counted in ``admission``."""
         iterator = iter(frames)
         while True:
             start = time.perf_counter()
             frame = next(iterator, None)
             if frame is None:
                 return
-            if self.admission.admits(frame.stamp_ns):
+            if isinstance(frame, FrameError):
+                self.admission.rejected += 1
+            elif self.admission.admits(frame.stamp_ns):
                 yield self._process(frame, 1e3 * (time.perf_counter() - start))
 
-    def finish(self) -> list[Estimate]:
-        """Estimates of a method that answers only after the last frame; empty for causal ones."""
-        return self._method.finish()
+    def finish(self, steps: list[Step]) -> list[Step]:
+        """The collected steps with the answers of a method that gives them only after the last frame."""
+        return [replace(step, estimate=final) for step, final in zip(steps, self._method.finish(), strict=True)]
 
     def _process(self, frame: Frame, decode_ms: float) -> Processed:
         seen = frame if self._masks_given else replace(frame, given_mask=None)
@@ -140,34 +151,63 @@ class Source:
     """A recording that was opened, with its target."""
 
     path: Path
-    recording: Recording
+    recording: Recording | BagReader
     target: Target
 
-    def frames(self, start: int = 0, limit: int | None = None) -> Iterator[Frame]:
-        """Frames from number ``start`` on, at most ``limit`` of them."""
+    def frames(self, start: int = 0, limit: int | None = None) -> Iterator[Frame | FrameError]:
+        """Frames from number ``start`` on, at most ``limit`` of them; a malformed one comes as its error."""
         stop = None if limit is None else start + limit
-        return islice(self.recording.frames(stop), start, None)
+        attempts = _attempts(self.recording) if isinstance(self.recording, BagReader) else self.recording.frames(stop)
+        return islice(attempts, start, stop)
 
     def count(self, start: int = 0, limit: int | None = None) -> int:
         """How many frames :meth:`frames` brings."""
         rest = max(0, len(self.recording) - start)
         return rest if limit is None else min(rest, limit)
 
+    @property
+    def frame_id(self) -> str:
+        """``header.frame_id`` of the images."""
+        return self.recording.frame_id if isinstance(self.recording, BagReader) else "camera"
+
+    def truth_rows(self) -> dict[int, NDArray[np.float64]]:
+        """Stamp -> true pose row (7,), empty when unknown."""
+        if isinstance(self.recording, BagReader):
+            return self.recording.truth_rows()
+        return {stamp: lie.row_from_matrix(T) for stamp, T in self.recording.truth().items()}
+
+
+def _attempts(bag: BagReader) -> Iterator[Frame | FrameError]:
+    """The frames of a bag; one that cannot be decoded does not end the stream."""
+    for packet in bag.packets():
+        kind = f"sensor_msgs/msg/{'CompressedImage' if packet.compressed else 'Image'}"
+        try:
+            rgb = decode_image(deserialize(packet.image, kind, bag.path))
+            mask = packet.mask and decode_mask(deserialize(packet.mask, "sensor_msgs/msg/Image", bag.path))
+            yield Frame(packet.stamp_ns, rgb, bag.camera, mask)
+        except FrameError as error:
+            yield error
+
 
 def open_source(path: str | Path) -> Source:
     """Open a bag or a folder of the ``sequence`` layout, and the CAD model beside it.
 
     Raises:
-        UsageError: there is nothing of that name.
-        InputError: it is neither, or is malformed.
+        UsageError: there is nothing of that name, or it is neither.
+        InputError: it is malformed, or no CAD model lies beside it.
     """
     path = Path(path)
     if not path.exists():
         raise UsageError(f"recording {path}: no such file or folder")
     if (path / "labels.json").is_file():
-        recording = load_sequence(path)
-        return Source(path, recording, load_target(recording.target_path, recording.unit_scale))
-    raise UsageError(f"recording {path}: neither a bag (metadata.yaml) nor a sequence folder (labels.json)")
+        sequence = load_sequence(path)
+        return Source(path, sequence, load_target(sequence.target_path, sequence.unit_scale))
+    if path.suffix != ".mcap" and not (path / "metadata.yaml").is_file():
+        raise UsageError(f"recording {path}: neither a bag (metadata.yaml) nor a sequence folder (labels.json)")
+    bag = BagReader(path)
+    if bag.target_path is None:
+        raise BagError(f"{path} has no target.yaml: put the CAD model and a target.yaml that names it into the folder")
+    return Source(path, bag, load_target(bag.target_path))
 
 
 def latency_summary(rows: list[tuple[float, ...]]) -> dict[str, float]:

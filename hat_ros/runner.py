@@ -1,25 +1,46 @@
-"""From a recording to a finished result folder, in this process (``hat track``)."""
+"""From a recording to a finished result folder, in this process (``hat track``); and the last steps of any run."""
 
 from __future__ import annotations
 
+import json
 import resource
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hat_ros import lie
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
 from hat_ros.config import HatConfig
 from hat_ros.errors import RunError
-from hat_ros.evaluation.runlog import RunLog, RunLogBuilder
+from hat_ros.evaluation.metrics import mask_summary
+from hat_ros.evaluation.overlay import OverlayPainter, VideoFile
+from hat_ros.evaluation.report import write_report
+from hat_ros.evaluation.runlog import RunLog
 from hat_ros.evaluation.score import score_run, write_json
 from hat_ros.methods import create_method
 from hat_ros.pipeline import MEASURED, Pipeline, Processed, Source, latency_summary, open_source
 from hat_ros.provenance import describe_run
-from hat_ros.results import METRICS_FILE, RUN_FILE, LiveTables, ResultFolder, write_config, write_tables
+from hat_ros.result_bag import ResultBagWriter, read_result_bag
+from hat_ros.results import (
+    BAG_FOLDER,
+    CONFIG_FILE,
+    METRICS_FILE,
+    RUN_FILE,
+    LiveTables,
+    ResultFolder,
+    write_config,
+    write_tables,
+)
+from hat_ros.tracker import Step
+from hat_ros.types import Frame, TrackState
 
 # Segmentation backends that pass on what the recording brings; all others must find the target themselves.
 GIVEN_MASK_BACKENDS = ("annotated",)
+STRIP_FRAMES = 12
 
 Watcher = Callable[[Processed, int], None]
 
@@ -65,45 +86,104 @@ def track(path: Path, out: Path, config: HatConfig, options: TrackOptions, watch
     folder = ResultFolder(out, options.overwrite)
     source = open_source(path)
     method = create_method(options.mode, config, source.target)
+    pipeline = Pipeline(method, config.segmentation.backend in GIVEN_MASK_BACKENDS)
     with folder:
-        write_config(folder.path, config)
-        write_json(
-            folder.path / RUN_FILE,
-            describe_run(path, config, mode=options.mode, start=options.start, limit=options.limit),
-        )
-        pipeline = Pipeline(method, config.segmentation.backend in GIVEN_MASK_BACKENDS)
+        begin_folder(folder.path, path, config, mode=options.mode, start=options.start, limit=options.limit)
         try:
-            log, measured = _collect(pipeline, source, folder.path, options, watch)
+            measured = _run(pipeline, source, folder, options, watch)
+            complete_folder(folder.path, source, measured, video=options.video, report=options.report)
         except OSError as error:
-            raise RunError(f"{error.strerror}: the run stopped, what was done is in {folder.path}") from None
-        figures = score_run(log, source.target) | measured
-        write_tables(folder.path, log)
-        write_json(folder.path / METRICS_FILE, figures)
+            raise RunError(f"the run stopped ({error.strerror}); what was done is in {folder.path}") from None
     return folder.final_path
 
 
-def _collect(
-    pipeline: Pipeline, source: Source, path: Path, options: TrackOptions, watch: Watcher | None
-) -> tuple[RunLog, dict[str, Any]]:
-    builder, rows = RunLogBuilder(), []
+def begin_folder(folder: Path, recording: Path, config: HatConfig, **how: Any) -> None:
+    """Write what is known before a run: ``config.yaml`` and ``run.json``."""
+    write_config(folder, config)
+    write_json(folder / RUN_FILE, describe_run(recording, config, **how))
+
+
+def _run(
+    pipeline: Pipeline, source: Source, folder: ResultFolder, options: TrackOptions, watch: Watcher | None
+) -> dict[str, Any]:
+    """Process all frames, write bag and live tables, return what was measured."""
+    rows: list[tuple[float, ...]] = []
+    steps: list[Step] = []
     total = source.count(options.start, options.limit)
-    tables = LiveTables(path, MEASURED)
-    stamps = []
-    try:
-        for done in pipeline.run(source.frames(options.start, options.limit)):
-            step = done.step
-            builder.add(step.candidates, step.motion, step.estimate)
-            rows.append(done.measured())
-            stamps.append(done.frame.stamp_ns)
-            tables.add(step.estimate, rows[-1])
-            if watch is not None:
-                watch(done, total)
-    finally:
-        tables.close()
-    builder.revise(pipeline.finish())
-    builder.dropped_total = pipeline.admission.rejected
+    with (
+        closing(LiveTables(folder.path, MEASURED)) as tables,
+        ResultBagWriter(folder.bag_path, source.frame_id, source.target.name) as bag,
+    ):
+        try:
+            for done in pipeline.run(source.frames(options.start, options.limit)):
+                rows.append(done.measured())
+                if pipeline.causal:
+                    tables.add(done.step.estimate, rows[-1])
+                    bag.write_step(done.step, pipeline.admission.rejected)
+                else:
+                    steps.append(done.step)
+                if watch is not None:
+                    watch(done, total)
+            for step, row in zip(pipeline.finish(steps), rows[: len(steps)], strict=True):
+                tables.add(step.estimate, row)
+                bag.write_step(step, pipeline.admission.rejected)
+        finally:
+            bag.write_context(source.recording.camera, source.truth_rows())
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    measured = latency_summary(rows) | {"peak_memory_mib": peak_mib}
-    first, last = (stamps[0], stamps[-1]) if stamps else (0, -1)
-    truth = {stamp: lie.row_from_matrix(T) for stamp, T in source.recording.truth().items() if first <= stamp <= last}
-    return builder.build(truth), measured
+    overlap = np.array([row[MEASURED.index("mask_iou")] for row in rows])
+    return latency_summary(rows) | mask_summary(overlap) | {"peak_memory_mib": peak_mib}
+
+
+def complete_folder(folder: Path, source: Source | None, measured: dict[str, Any], video: bool, report: bool) -> None:
+    """Derive everything else of a result folder from its bag: tables, metrics, report, overlay.
+
+    Args:
+        folder: holds ``bag``, ``config.yaml`` and ``run.json``.
+        source: the recording, for overlay and ADD-S; None leaves both out.
+        measured: what the run itself measured (speed, memory, masks); goes into ``metrics.json``.
+        video: write the overlay video.
+        report: write ``report.html``.
+
+    Raises:
+        BagError: the result bag is missing or damaged.
+    """
+    log = read_result_bag(folder / BAG_FOLDER)
+    figures = score_run(log, source.target if source else None) | measured
+    write_tables(folder, log)
+    write_json(folder / METRICS_FILE, figures)
+    strip = paint_overlay(folder, source, log, video) if source and (video or report) else []
+    if report:
+        run = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+        config_text = (folder / CONFIG_FILE).read_text(encoding="utf-8")
+        title = f"{Path(run['source']).name}: {run.get('mode', 'hat')}"
+        write_report(folder / "report.html", title, log, figures, run, config_text, strip)
+
+
+def paint_overlay(folder: Path, source: Source, log: RunLog, video: bool) -> list[tuple[str, NDArray[np.uint8]]]:
+    """Draw the run into its images: the video, and captioned frames for the report."""
+    wanted = (
+        {int(log.stamp_ns[i]) for i in np.linspace(0, len(log) - 1, STRIP_FRAMES).astype(int)} if len(log) else set()
+    )
+    index = {int(stamp): i for i, stamp in enumerate(log.stamp_ns)}
+    painter = OverlayPainter(source.target)
+    camera = source.recording.camera
+    period = np.median(np.diff(log.stamp_ns)) * 1e-9 if len(log) > 1 else 0.1
+    file = (
+        VideoFile(folder / "overlay", camera.width, camera.height, float(np.clip(1 / period, 1, 60))) if video else None
+    )
+    strip = []
+    for frame in source.frames():
+        i = index.pop(frame.stamp_ns, None) if isinstance(frame, Frame) else None
+        if i is None or not (video or frame.stamp_ns in wanted):
+            continue
+        note = f"{(log.stamp_ns[i] - log.stamp_ns[0]) * 1e-9:.1f} s"
+        pose_row = log.pose_rows[i] if log.has_output[i] else np.full(7, np.nan)
+        image = painter.paint(frame.rgb, camera, TrackState(int(log.state[i])), pose_row, note, log.truth_rows[i])
+        if file is not None:
+            file.add(image)
+        if frame.stamp_ns in wanted:
+            scale = min(1.0, 640 / camera.width)
+            strip.append((f"{note}, {TrackState(int(log.state[i])).name}", cv2.resize(image, None, fx=scale, fy=scale)))
+    if file is not None:
+        file.close()
+    return strip

@@ -103,8 +103,12 @@ class RunLogBuilder:
         self._rows: list[dict[str, Any]] = []
         self.dropped_total = 0
 
-    def add(self, candidates: Candidates, motion: Motion, estimate: Estimate) -> None:
-        """Append one frame; stamps must increase."""
+    def add(
+        self, candidates: Candidates, motion: Motion, estimate: Estimate, alignment_version: int | None = None
+    ) -> None:
+        """Append one frame; stamps must increase. The version is needed where the estimate lacks its alignment."""
+        if alignment_version is None:
+            alignment_version = estimate.alignment.version if estimate.alignment else 0
         self._rows.append(
             {
                 "stamp_ns": estimate.stamp_ns,
@@ -114,7 +118,7 @@ class RunLogBuilder:
                 "keyframe": estimate.keyframe,
                 "anchor": estimate.anchor,
                 "gate_weight": estimate.gate_weight,
-                "alignment_version": estimate.alignment.version if estimate.alignment else 0,
+                "alignment_version": alignment_version,
                 "slam_epoch": estimate.slam_epoch,
                 "gap_frames": estimate.gap_frames,
                 "candidates": candidates.pose_rows,
