@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,19 +30,23 @@ class Runtime:
         self.device = torch.device("cuda" if use_cuda else "cpu")
         self.dtype = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}[config.precision]
 
-    def place(self, net: torch.nn.Module) -> Callable[[torch.Tensor], torch.Tensor]:
-        """The network on the device, for inference only, answering in float32.
+    def place(self, net: torch.nn.Module) -> Callable[..., Any]:
+        """The network on the device, for inference only, and :meth:`wrap` around it."""
+        return self.wrap(net.to(self.device).eval().requires_grad_(False))
+
+    def wrap(self, net: torch.nn.Module) -> Callable[..., Any]:
+        """A placed network that computes in the chosen precision and answers in float32.
 
         Reduced precision covers the network alone: the geometry around it (boxes, poses) stays in float32, and so does
         everything on the CPU, where parity is promised.
         """
-        net = net.to(self.device).eval().requires_grad_(False)
         if self.device.type == "cpu" or self.dtype == torch.float32:
             return net
 
-        def run(x: torch.Tensor) -> torch.Tensor:
+        def run(*inputs: torch.Tensor) -> Any:
             with torch.autocast(self.device.type, dtype=self.dtype):
-                return net(x).float()
+                out = net(*inputs)
+            return [x.float() for x in out] if isinstance(out, (list, tuple)) else out.float()
 
         return run
 
