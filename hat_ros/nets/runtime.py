@@ -30,6 +30,11 @@ class Runtime:
         self.device = torch.device("cuda" if use_cuda else "cpu")
         self.dtype = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}[config.precision]
 
+    @property
+    def reduced_precision(self) -> bool:
+        """Whether networks compute in less than float32; never on the CPU."""
+        return self.device.type != "cpu" and self.dtype != torch.float32
+
     def place(self, net: torch.nn.Module) -> Callable[..., Any]:
         """The network on the device, for inference only, and :meth:`wrap` around it."""
         return self.wrap(net.to(self.device).eval().requires_grad_(False))
@@ -40,7 +45,7 @@ class Runtime:
         Reduced precision covers the network alone: the geometry around it (boxes, poses) stays in float32, and so does
         everything on the CPU, where parity is promised.
         """
-        if self.device.type == "cpu" or self.dtype == torch.float32:
+        if not self.reduced_precision:
             return net
 
         def run(*inputs: torch.Tensor) -> Any:

@@ -1,0 +1,119 @@
+"""GigaPose followed by MegaPose's refiner: the paper's "GigaPose + ref." baseline as a hypothesis backend."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from hat_ros import lie
+from hat_ros.cache import cached_arrays
+from hat_ros.config import HatConfig
+from hat_ros.hypotheses.megapose import MegaPose
+from hat_ros.hypotheses.picopose import fingerprint
+from hat_ros.hypotheses.picopose_templates import CROP_PX, TEMPLATE_K, TEMPLATE_SIZE, template_poses
+from hat_ros.nets import gigapose as gp
+from hat_ros.nets import picopose as pp
+from hat_ros.nets.checkpoint import load_into, load_state
+from hat_ros.render.network_views import NetworkViewRenderer
+from hat_ros.target import Target
+from hat_ros.types import Candidates, Detection, Frame, PosePrior
+
+_FORMAT = 1
+
+
+class GigaPoseHypotheses:
+    """Stage 2 backend ``gigapose``.
+
+    Raises:
+        WeightsError: a checkpoint (GigaPose's, MegaPose's two) is missing or does not fit.
+    """
+
+    def __init__(self, config: HatConfig, target: Target) -> None:
+        self._megapose = MegaPose(config, target)
+        self._runtime = self._megapose.runtime
+        self._n_candidates = config.hypotheses.max_candidates
+        self._batch_size = config.hypotheses.picopose.batch_size
+        state = load_state("gigapose", config.nets.weights_folder or None)
+        self._net = gp.GigaPoseNet()
+        load_into(self._net, state, "gigapose")
+        self._runtime.place(self._net)
+        self._describe = self._runtime.wrap(self._net.ae_net)
+        self._describe_ist = self._runtime.wrap(self._net.ist_net.backbone)
+        key = f"{_FORMAT}:{target.sha256}:{fingerprint(state)}"
+        arrays = cached_arrays("gigapose", key, lambda: self._build(target))
+        self._templates = {name: self._runtime.tensor(array) for name, array in arrays.items()}
+
+    @torch.inference_mode()
+    def _build(self, target: Target) -> dict[str, NDArray]:
+        renderer, poses = NetworkViewRenderer(target), template_poses(target)
+        crops, masks, Ms = [], [], []
+        for T in poses:
+            rgb = renderer.render(T, TEMPLATE_K, TEMPLATE_SIZE)[..., :3]
+            mask = rgb.any(axis=2)
+            M = letterbox(mask)
+            crops.append(cut(rgb, M))
+            masks.append(cut(mask.astype(np.uint8), M))
+            Ms.append(M)
+        features, ist = [], []
+        for i in range(0, len(poses), self._batch_size):
+            batch = _network_input(self._runtime.tensor(np.stack(crops[i : i + self._batch_size])))
+            features.append(self._describe(batch).cpu().numpy())
+            ist.append(self._describe_ist(batch).cpu().numpy())
+        small = pp.patch_mask(torch.from_numpy(np.stack(masks).astype(np.float32))).numpy()
+        arrays = {"features": np.concatenate(features), "ist": np.concatenate(ist), "masks": small}
+        return arrays | {"M": np.stack(Ms), "T_cam_target": poses}
+
+    @torch.inference_mode()
+    def generate(self, frame: Frame, detection: Detection, prior: PosePrior | None) -> Candidates:
+        """K poses refined by MegaPose, scored by its coarse logits; the prior is not used (published behaviour)."""
+        tensor, bank = self._runtime.tensor, self._templates
+        M = letterbox(detection.mask)
+        batch = _network_input(tensor(cut(frame.rgb, M))[None])
+        mask = pp.patch_mask(tensor(cut(detection.mask.astype(np.uint8), M))[None])[0]
+        matches = gp.match(self._describe(batch)[0], mask, bank["features"], bank["masks"])
+        scores = torch.stack([m.similarity.sum() for m in matches])
+        best = [int(i) for i in scores.topk(min(self._n_candidates, len(scores))).indices if scores[i] > 0]
+        if not best:
+            return Candidates.none()
+        ist = self._describe_ist(batch)[0].flatten(1)
+        affine = torch.stack([self._affine(ist, bank["ist"][i].flatten(1), matches[i]) for i in best])
+        K = tensor(frame.camera.K)
+        T = pp.affine_pose(affine, tensor(M), K, bank["T_cam_target"][best], bank["M"][best], tensor(TEMPLATE_K))
+        T, logits = self._megapose.refine(self._runtime.image(frame.rgb), K, T)
+        T, logits = T.double().cpu().numpy(), logits.double().cpu().numpy()
+        rigid = lie.is_rigid(T)
+        return Candidates.from_matrices(T[rigid], logits[rigid], detection.box_xyxy)
+
+    def reset(self) -> None:
+        """Nothing is learned from earlier frames."""
+
+    def _affine(self, image: Tensor, template: Tensor, matches: gp.Matches) -> Tensor:
+        scale, inplane = self._net.ist_net.regressor(image[:, matches.image].T, template[:, matches.template].T)
+        return gp.best_similarity(gp.patch_px(matches.template), gp.patch_px(matches.image), scale, inplane)[0]
+
+
+def letterbox(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """(3, 3) affine from image to crop pixels: the tight box, longer side 224, the shorter one centred."""
+    rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    size = np.array([cols[-1] + 1 - cols[0], rows[-1] + 1 - rows[0]])
+    scale = CROP_PX / size.max()
+    shift = (CROP_PX - scale * size) // 2 - scale * np.array([cols[0], rows[0]])
+    return np.array([[scale, 0, shift[0]], [0, scale, shift[1]], [0, 0, 1.0]])
+
+
+def cut(image: NDArray[np.uint8], M: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Crop by ``M`` with nearest sampling and zeros outside: (H, W[, 3]) -> (224, 224[, 3])."""
+    # Pixel edges at integers: crop pixel centre i + 0.5 comes from image pixel floor(M^-1 (i + 0.5)).
+    at = np.arange(CROP_PX) + 0.5
+    cols, rows = np.floor((at - M[0, 2]) / M[0, 0]).astype(int), np.floor((at - M[1, 2]) / M[1, 1]).astype(int)
+    inside = ((rows >= 0) & (rows < image.shape[0]))[:, None] & ((cols >= 0) & (cols < image.shape[1]))[None]
+    out = image[rows.clip(0, image.shape[0] - 1)[:, None], cols.clip(0, image.shape[1] - 1)[None]].copy()
+    out[~inside] = 0
+    return out
+
+
+def _network_input(crops_rgb: Tensor) -> Tensor:
+    """(B, 224, 224, 3) 0..255 RGB -> normalised (B, 3, 224, 224)."""
+    return pp.normalise_crops(crops_rgb.permute(0, 3, 1, 2) / 255)

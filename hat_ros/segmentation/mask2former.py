@@ -1,0 +1,139 @@
+"""Mask2Former (COCO instances) through `transformers`, with a choice rule for a target that is no COCO class.
+
+Cheng et al., "Masked-attention Mask Transformer for Universal Image Segmentation", CVPR 2022. The published weights are
+CC BY-NC 4.0 (non-commercial). They are read from a local folder only. A spacecraft comes out as an airplane, a kite, a
+boat: the class is ignored. Among the instances, the one wins whose score, size, compactness and overlap with the
+previous mask are best together; the paper does not publish its rule.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from transformers import Mask2FormerForUniversalSegmentation, Mask2FormerImageProcessor
+
+from hat_ros.config import HatConfig, Mask2FormerConfig
+from hat_ros.errors import WeightsError
+from hat_ros.nets.checkpoint import find
+from hat_ros.nets.runtime import Runtime
+from hat_ros.target import Target
+from hat_ros.types import Detection, Frame, PosePrior
+
+_N_INSTANCES = 100
+
+
+class Mask2FormerSegmenter:
+    """Stage 1 backend ``mask2former``; see the module's text.
+
+    Raises:
+        WeightsError: the weights folder is missing or cannot be read.
+    """
+
+    def __init__(self, config: HatConfig, target: Target) -> None:
+        self._settings = config.segmentation.mask2former
+        self._runtime = Runtime(config.nets)
+        folder = find("mask2former", config.nets.weights_folder or None)
+        self._processor, model = _load(folder)
+        self._model = model.to(self._runtime.device).eval().requires_grad_(False)
+        self._previous: NDArray[np.bool_] | None = None
+
+    @torch.inference_mode()
+    def update(self, frame: Frame, prior: PosePrior | None) -> Detection | None:
+        """The chosen instance, None when none scores ``min_score``; the prior is not used (published behaviour)."""
+        inputs = self._processor(images=frame.rgb, return_tensors="pt").to(self._runtime.device)
+        with torch.autocast(
+            self._runtime.device.type, dtype=self._runtime.dtype, enabled=self._runtime.reduced_precision
+        ):
+            outputs = self._model(**inputs)
+        padded = tuple(inputs["pixel_values"].shape[-2:])
+        visible = tuple(int(n) for n in inputs["pixel_mask"][0].nonzero().amax(dim=0) + 1)
+        masks, scores = instances(
+            outputs.class_queries_logits[0].float(), outputs.masks_queries_logits[0].float(), padded, visible,
+            frame.rgb.shape[:2],
+        )  # fmt: skip
+        chosen = choose(masks.cpu().numpy(), scores.cpu().numpy(), self._previous, self._settings)
+        if chosen is None:
+            return None
+        self._previous = chosen
+        return Detection(chosen)
+
+    def reset(self) -> None:
+        """Forget the previous mask."""
+        self._previous = None
+
+
+def instances(
+    class_logits: torch.Tensor,
+    mask_logits: torch.Tensor,
+    padded_hw: tuple[int, ...],
+    visible_hw: tuple[int, ...],
+    image_hw: tuple[int, ...],
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Instance masks and scores from the network's queries (the published post-processing).
+
+    Args:
+        class_logits: (Q, C + 1), the last class is "no object". mask_logits: (Q, h, w).
+        padded_hw: network input size. visible_hw: the part of it that is image. image_hw: the original image.
+
+    Returns:
+        (N, H, W) bool masks and (N,) scores: class probability times mean mask probability inside the mask.
+    """
+    probability = class_logits.softmax(dim=1)[:, :-1]
+    n_classes = probability.shape[1]
+    score, index = probability.flatten().topk(min(_N_INSTANCES, probability.numel()))
+    resize = torch.nn.functional.interpolate
+    logits = resize(mask_logits[None], size=padded_hw, mode="bilinear", align_corners=False)
+    logits = logits[..., : visible_hw[0], : visible_hw[1]]
+    logits = resize(logits, size=image_hw, mode="bilinear", align_corners=False)[0]
+    masks = logits > 0
+    quality = (logits.sigmoid() * masks).flatten(1).sum(dim=1) / (masks.flatten(1).sum(dim=1) + 1e-6)
+    query = index // n_classes
+    return masks[query], score * quality[query]
+
+
+def choose(
+    masks: NDArray[np.bool_],
+    scores: NDArray[np.float32],
+    previous: NDArray[np.bool_] | None,
+    settings: Mask2FormerConfig,
+) -> NDArray[np.bool_] | None:
+    """The instance that is the target: (N, H, W), (N,) -> (H, W), or None.
+
+    Merit = score x square root of the area + weighted compactness (share of the convex hull that is filled) +
+    weighted overlap with the previous mask; instances that fill nearly the whole image are background.
+    """
+    best, best_merit = None, 0.0
+    for mask, score in zip(masks, scores, strict=True):
+        share = float(mask.mean())
+        if score < settings.min_score or not 0 < share < 0.95:
+            continue
+        merit = float(score) * (1.0 + np.sqrt(share)) + settings.compactness_weight * _compactness(mask)
+        if previous is not None:
+            overlap = np.count_nonzero(mask & previous) / np.count_nonzero(mask | previous)
+            merit += settings.temporal_weight * overlap
+        if merit > best_merit:
+            best, best_merit = mask, merit
+    return best
+
+
+def _compactness(mask: NDArray[np.bool_]) -> float:
+    points = cv2.findNonZero(mask.astype(np.uint8))
+    hull = cv2.contourArea(cv2.convexHull(points))
+    return min(np.count_nonzero(mask) / max(hull, 1.0), 1.0)
+
+
+def _load(folder: Path) -> tuple[Mask2FormerImageProcessor, Mask2FormerForUniversalSegmentation]:
+    try:
+        processor = Mask2FormerImageProcessor.from_pretrained(folder, local_files_only=True)
+        model = Mask2FormerForUniversalSegmentation.from_pretrained(folder, local_files_only=True, use_safetensors=True)
+    except (OSError, ValueError, RuntimeError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise WeightsError(
+            f"mask2former: {folder} is not a complete folder (config.json, preprocessor_config.json, "
+            f"model.safetensors): {reason}"
+        ) from None
+    return processor, model
