@@ -151,7 +151,7 @@ class AlignmentConfig:
     lever_m_per_rad: float = option(1.0, "lambda: metres per radian in all residuals", low=1e-9)
     min_observations: int = option(3, "joint anchor/SLAM observations of the first fit", low=3)
     refit_interval_frames: int = option(10, "frames between refits", low=1)
-    max_observations: int = option(256, "observations kept for refits; older ones are thinned evenly", low=8)
+    max_observations: int = option(2048, "observations kept one by one; beyond it older inliers are folded", low=8)
     rejection_factor: float = option(3.0, "outliers lie beyond this factor of the inliers' median residual", low=1)
     first_rejection_rounds: int = option(3, "outlier rounds of the first fit", low=0)
     refit_rejection_rounds: int = option(1, "outlier rounds of a refit", low=0)
@@ -183,6 +183,10 @@ class RefinementConfig:
     max_points: int = option(300, "contour points used", low=50, high=5000)
     max_rotation_deg: float = option(12.0, "a refinement that turns further left its basin: refused", low=0, high=180)
     max_shift: float = option(0.15, "and so is one that moves further, as a share of the range", low=0, high=1)
+    min_overlap: float = option(0.6, "silhouette overlap with the mask that a supported pose needs", low=0, high=1)
+    min_support: float = option(0.4, "share of the contour that must agree with the image", low=0, high=1)
+    same_pose_deg: float = option(5.0, "an anchor this close to the track is not refined once more", low=0, high=180)
+    arbitration_margin: float = option(0.15, "summed lead in image evidence that decides between basins", low=0)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,197 @@
+"""Stage 4 with an eye on the image: every output is refined where it is, causally. Our extension of the paper.
+
+The paper refines offline and lets SLAM and anchors alone carry the causal pose. Here each frame's prediction (relative
+motion applied to the previous output) is refined on that frame's own image, and an accepted refinement is a measurement
+like an anchor: it becomes the output, and with it the previous output of the next frame.
+
+At keyframes the selected anchor competes with the track:
+
+* Within D of the track it is one basin: the better of the two refinements wins, and the anchor serves as a second start
+  when the track's own refinement fails.
+* Beyond D it is a rival. Successive rivals that follow from each other (the paper's coherence) add up; the image may
+  decide early. The rival takes over when it is supported and the track is not, when its lead in image evidence, summed
+  over coherent rivals, reaches ``arbitration_margin``, or after ``reset_anchors`` coherent rivals as in the paper,
+  unless the image speaks against them by that margin. Before the warm-up is over a single rival is enough: the first
+  anchors are chosen by appearance alone.
+
+With neither refinement accepted, the output is what the paper's fusion makes of prediction and anchor, and it coasts.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+
+from hat_ros import lie
+from hat_ros.config import HatConfig
+from hat_ros.core.alignment import SlamAlignment
+from hat_ros.core.causal import Dissent, Fused, fuse_two, relative_motion
+from hat_ros.core.prior import extrapolate
+from hat_ros.core.refiner import Refiner
+from hat_ros.types import Detection, Float, Frame, Motion, Refined
+
+# Measured outputs behind the constant-rate prediction.
+_RATE_HISTORY = 6
+
+
+class RefinedFusion:
+    """Track, anchors and image evidence, frame by frame.
+
+    Attributes:
+        alignment: the Sim(3), fitted to measured outputs at keyframes.
+    """
+
+    def __init__(self, config: HatConfig, refiner: Refiner) -> None:
+        self._fusion, self._refinement = config.fusion, config.refinement
+        self._alignment_config = config.alignment
+        self._refiner = refiner
+        self.alignment = SlamAlignment(config.alignment)
+        self._dissent = Dissent(config.fusion.gate_angle_deg, config.alignment.reset_anchors)
+        self._lead = 0.0
+        self._epoch = 0
+        self.lose()
+
+    def lose(self) -> None:
+        """Give the track up: the next supported anchor starts afresh."""
+        self._output: tuple[Float, Motion] | None = None
+        self._measured: deque[tuple[int, Float]] = deque(maxlen=_RATE_HISTORY)
+        self._forget_rivals()
+
+    def update(
+        self, frame: Frame, detection: Detection | None, motion: Motion, anchor: Float | None, confidence: float
+    ) -> Fused:
+        """Advance by one frame; arguments as :meth:`CausalFusion.update`, beside the image."""
+        if motion.epoch != self._epoch:
+            self._epoch = motion.epoch
+            self.alignment.reset()
+        predictions = self._predictions(frame.stamp_ns, motion)
+        fused = self._decide(frame, detection, predictions, anchor, confidence)
+        if fused.reset:
+            self.alignment.reset()
+            self._measured.clear()
+        if fused.measurement is not None:
+            self._measured.append((frame.stamp_ns, fused.measurement))
+            if anchor is not None and motion.valid:
+                self.alignment.observe(fused.measurement, motion.T_slam_cam)
+        self.alignment.update(motion.epoch)
+        self._output = None if fused.T_cam_target is None else (fused.T_cam_target, motion)
+        return fused
+
+    def _decide(
+        self,
+        frame: Frame,
+        detection: Detection | None,
+        predictions: list[Float],
+        anchor: Float | None,
+        confidence: float,
+    ) -> Fused:
+        track = self._first_accepted(frame, detection, predictions)
+        if not predictions:
+            return self._start(frame, detection, anchor)
+        predicted = predictions[0]
+        if anchor is None:
+            return _outcome(track, predicted, predicted)
+        reference = predicted if track is None else track.T_cam_target
+        if not self._dissent.update(anchor, reference):
+            self._forget_rivals()
+            return self._agree(frame, detection, track, predicted, anchor, confidence)
+        return self._arbitrate(frame, detection, track, predicted, anchor)
+
+    def _start(self, frame: Frame, detection: Detection | None, anchor: Float | None) -> Fused:
+        """Without a track, an anchor that the image supports starts one; the very first may start unsupported."""
+        if anchor is None:
+            return Fused(None)
+        refined = self._first_accepted(frame, detection, [anchor])
+        return replace(_outcome(refined, anchor, None), gate_weight=1.0)
+
+    def _agree(
+        self,
+        frame: Frame,
+        detection: Detection | None,
+        track: Refined | None,
+        predicted: Float,
+        anchor: Float,
+        confidence: float,
+    ) -> Fused:
+        """Anchor and track share a basin: the better refinement, else the paper's fusion of the two."""
+        apart = lie.angle_between(anchor[:3, :3], (predicted if track is None else track.T_cam_target)[:3, :3])
+        if track is None or apart > np.radians(self._refinement.same_pose_deg):
+            other = self._first_accepted(frame, detection, [anchor])
+            if quality(other) > quality(track):
+                track = other
+        between = fuse_two(anchor, confidence, predicted, self._fusion, self._alignment_config.lever_m_per_rad)
+        return replace(_outcome(track, between, predicted), gate_weight=1.0)
+
+    def _arbitrate(
+        self, frame: Frame, detection: Detection | None, track: Refined | None, predicted: Float, anchor: Float
+    ) -> Fused:
+        """Anchor and track stand in different basins: weigh the evidence so far."""
+        rival = self._first_accepted(frame, detection, [anchor])
+        lead = quality(rival) - quality(track)
+        self._lead = lead if self._dissent.count == 1 else self._lead + lead
+        settled = self.alignment.n_observations >= self._fusion.warmup_observations
+        needed = self._alignment_config.reset_anchors if settled else 1
+        margin = self._refinement.arbitration_margin
+        takes_over = (
+            (rival is not None and track is None)
+            or self._lead >= margin
+            or (self._dissent.count >= needed and self._lead > -margin)
+        )
+        if not takes_over:
+            return replace(_outcome(track, predicted, predicted), gate_weight=self._fusion.gate_weight)
+        self._forget_rivals()
+        return replace(_outcome(rival, anchor, None), gate_weight=1.0, reset=True)
+
+    def _forget_rivals(self) -> None:
+        self._dissent.clear()
+        self._lead = 0.0
+
+    def _predictions(self, stamp_ns: int, motion: Motion) -> list[Float]:
+        """Where the track should be now, best first; empty without a track."""
+        if self._output is None:
+            return []
+        output, previous = self._output
+        out = []
+        scale = 0.0 if self.alignment.current is None else self.alignment.current.scale
+        step = relative_motion(previous, motion, scale)
+        if step is not None:
+            aligned = self.alignment.n_observations >= self._fusion.warmup_observations and scale > 0.0
+            position = (step @ output)[:3, 3] if aligned else output[:3, 3]
+            out.append(lie.transform(step[:3, :3] @ output[:3, :3], position))
+        if len(self._measured) >= 2:
+            stamps, poses = zip(*self._measured, strict=True)
+            row = extrapolate(np.array(stamps, dtype=np.int64), np.stack(poses), stamp_ns)
+            out.append(lie.matrix_from_row(row))
+        return out or [output]
+
+    def _first_accepted(self, frame: Frame, detection: Detection | None, starts: list[Float]) -> Refined | None:
+        """Refine from each start until the image supports one."""
+        for start in starts:
+            refined = self._refiner.refine(frame, detection, start)
+            if refined is not None and self._is_supported(refined):
+                return refined
+        return None
+
+    def _is_supported(self, refined: Refined) -> bool:
+        overlaps = np.isnan(refined.overlap) or refined.overlap >= self._refinement.min_overlap
+        return bool(overlaps and refined.support >= self._refinement.min_support)
+
+
+def quality(refined: Refined | None) -> float:
+    """Image evidence for a pose, 0 to 1: mean of silhouette overlap and contour support, 0 for a refused one.
+
+    Without a silhouette mask the contour speaks alone.
+    """
+    if refined is None:
+        return 0.0
+    return refined.support if np.isnan(refined.overlap) else 0.5 * (refined.support + refined.overlap)
+
+
+def _outcome(refined: Refined | None, otherwise: Float, predicted: Float | None) -> Fused:
+    """The refined pose as a measurement, or another pose without one."""
+    if refined is None:
+        return Fused(otherwise, predicted)
+    T = refined.T_cam_target
+    return Fused(T, predicted, measurement=T, covariance=refined.covariance)
