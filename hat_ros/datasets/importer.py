@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Collection, Iterator
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -67,6 +68,7 @@ def import_dataset(
     *,
     model: str | Path | None = None,
     sequences: Collection[str] = (),
+    boxes: bool = False,
     check: bool = False,
     progress: Progress | None = None,
 ) -> list[Path]:
@@ -77,6 +79,7 @@ def import_dataset(
     Args:
         fmt: see :func:`open_dataset`, as are ``root``, ``model`` and ``sequences``.
         out: where to.
+        boxes: give frames without a mask the box of the CAD at the true pose, see :func:`with_annotation_boxes`.
         check: also write ``NAME.check.png`` beside each bag, see :func:`check_picture`.
         progress: called with (sequence, frames done, frames in all).
 
@@ -91,6 +94,7 @@ def import_dataset(
     for recording in open_dataset(fmt, root, model, sequences):
         bag = out if fmt == "sequence" else out / recording.name
         if not _complete(bag):
+            recording = with_annotation_boxes(recording) if boxes else recording
             _write_bag(recording, bag, progress)
         elif progress is not None:
             progress(recording.name, len(recording), len(recording))
@@ -137,6 +141,24 @@ def _image(recording: ImageRecording, item: ImageFile) -> bytes | NDArray[np.uin
     if recording.distortion.any() or item.image.suffix.lower() not in (".jpg", ".jpeg", ".png"):
         return frame.rgb
     return item.image.read_bytes()
+
+
+def with_annotation_boxes(recording: ImageRecording) -> ImageRecording:
+    """Boxes from the labels for frames without a mask: the paper's regions for SHIRT, which has no detector of its own.
+
+    They land in ``/detection/mask`` as filled boxes (128) and are used by ``segmentation.backend=annotated`` alone.
+    """
+    vertices = load_target(recording.target_path, recording.unit_scale).vertices_m
+    files = []
+    for item in recording.files:
+        T = item.T_cam_target
+        if T is not None and not item.masks:
+            points = vertices @ T[:3, :3].T + T[:3, 3]
+            if points[:, 2].min() > 0:
+                uv = recording.camera.project(points)
+                item = replace(item, box_xyxy=np.concatenate([uv.min(axis=0), uv.max(axis=0)]))
+        files.append(item)
+    return replace(recording, files=files)
 
 
 def check_picture(recording: ImageRecording, width_px: int = 640) -> NDArray[np.uint8]:

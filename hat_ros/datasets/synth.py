@@ -49,7 +49,8 @@ class ClipSpec:
         psf_px: sigma of the point spread.
         star_count: stars in the field.
         earth: Earth behind the target, None = black sky.
-        table: whether the target lies on a textured table, at rest, seen by a moving camera.
+        table: whether the target lies on a textured table, at rest, seen by a moving camera; the sun rests too.
+        monochrome: a grey sensor.
         jpeg_quality: 0 writes PNG instead.
         supersample: rays per pixel and side.
         gloss: multiplies the specular reflection.
@@ -75,6 +76,7 @@ class ClipSpec:
     star_count: int = 0
     earth: Earth | None = None
     table: bool = False
+    monochrome: bool = False
     jpeg_quality: int = 92
     supersample: int = 2
     gloss: float = 1.0
@@ -145,8 +147,11 @@ def render_clip(target: Target, spec: ClipSpec, poses: Float | None = None) -> I
     renderer = SunlitRenderer(target, spec.supersample, spec.gloss)
     sky = _Backdrop(spec, camera, target)
     to_earth = None if spec.earth is None else np.asarray(spec.earth.nadir_cam, dtype=np.float64)
-    light = Light(np.asarray(spec.to_sun_cam, dtype=np.float64), spec.ambient, to_earth, 0.05)
+    to_sun = np.asarray(spec.to_sun_cam, dtype=np.float64)
     for index, T_cam_target in enumerate(poses):
+        if spec.table and index:
+            to_sun = T_cam_target[:3, :3] @ poses[index - 1][:3, :3].T @ to_sun
+        light = Light(to_sun, spec.ambient, to_earth, 0.05)
         radiance, coverage = renderer.render(T_cam_target, camera, light)
         image = radiance + sky.radiance(index, T_cam_target) * (1 - coverage[..., None])
         mask = renderer.plain.render(T_cam_target, camera, color=False).mask
@@ -175,13 +180,16 @@ class _Backdrop:
 def _expose(radiance: NDArray[np.float32], spec: ClipSpec, index: int) -> NDArray[np.uint8]:
     """Optics and sensor: point spread, saturation, shot and read noise, sRGB encoding."""
     image = radiance * np.float32(spec.exposure)
+    if spec.monochrome:
+        image = image @ np.array([0.3, 0.55, 0.15], np.float32)
     if spec.psf_px > 0:
         image = cv2.GaussianBlur(image, (0, 0), spec.psf_px)
     rng = np.random.default_rng([spec.seed, 4, index])
     if spec.noise > 0:
         sigma = np.sqrt(np.float32(spec.noise**2) + np.clip(image, 0, 1) / np.float32(_FULL_WELL))
         image = image + sigma * rng.standard_normal(image.shape, dtype=np.float32)
-    return _SRGB[(np.clip(image, 0, 1) * np.float32(len(_SRGB) - 1) + np.float32(0.5)).astype(np.int32)]
+    pixels = _SRGB[(np.clip(image, 0, 1) * np.float32(len(_SRGB) - 1) + np.float32(0.5)).astype(np.int32)]
+    return np.repeat(pixels[..., None], 3, axis=2) if spec.monochrome else pixels
 
 
 # sRGB encoding as a table: its steepest step is below half a grey level.
