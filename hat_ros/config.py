@@ -244,7 +244,7 @@ def preset_folder() -> Path:
         Path(__file__).resolve().parent.parent / "config",
         Path(sys.prefix) / "share" / "hat_ros" / "config",
         # colcon: <prefix>/lib/pythonX.Y/site-packages/hat_ros/config.py
-        Path(__file__).resolve().parents[4] / "share" / "hat_ros" / "config",
+        *(prefix / "share" / "hat_ros" / "config" for prefix in Path(__file__).resolve().parents[4:5]),
     ]
     for folder in candidates:
         if (folder / "default.yaml").is_file():
