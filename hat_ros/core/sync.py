@@ -1,0 +1,136 @@
+"""The rules by which frames enter the graph and messages meet again (DESIGN 5.1, 5.2), without any middleware.
+
+Streams are FIFO each; between streams any delay is possible. Nothing here looks at a clock or at arrival order, so the
+graph computes what one process would.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from hat_ros.errors import FrameError
+
+
+class ExactJoin:
+    """Joins one item of each named stream by exact stamp, and hands the joined sets out in stamp order.
+
+    A stamp for which a later one is already complete can never be completed (streams are FIFO), so it is abandoned
+    when the later one is taken, and counted in :attr:`abandoned`.
+
+    Args:
+        names: the streams.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names = tuple(names)
+        self._pending: dict[int, dict[str, Any]] = {}
+        self._newest_taken = -(2**63)
+        self.abandoned = 0
+        self.late = 0
+
+    def __len__(self) -> int:
+        """Stamps of which something is waiting."""
+        return len(self._pending)
+
+    def put(self, name: str, stamp_ns: int, item: Any) -> None:
+        """Add an item; one for a stamp that has been passed already is dropped and counted in :attr:`late`."""
+        if stamp_ns <= self._newest_taken:
+            self.late += 1
+            return
+        self._pending.setdefault(stamp_ns, {})[name] = item
+
+    def peek(self) -> int | None:
+        """Stamp of the earliest complete set, None when there is none."""
+        complete = [stamp for stamp, items in self._pending.items() if len(items) == len(self._names)]
+        return min(complete, default=None)
+
+    def take(self) -> tuple[int, dict[str, Any]]:
+        """Remove the earliest complete set and everything before it.
+
+        Raises:
+            LookupError: there is none; ask :meth:`peek` first.
+        """
+        stamp_ns = self.peek()
+        if stamp_ns is None:
+            raise LookupError("no complete set to take")
+        items = self._pending.pop(stamp_ns)
+        for stamp in [stamp for stamp in self._pending if stamp < stamp_ns]:
+            del self._pending[stamp]
+            self.abandoned += 1
+        self._newest_taken = stamp_ns
+        return stamp_ns, items
+
+    def missing(self) -> tuple[int, tuple[str, ...]] | None:
+        """The earliest incomplete stamp and the streams it still lacks; for diagnostics."""
+        waiting = sorted(stamp for stamp, items in self._pending.items() if len(items) < len(self._names))
+        if not waiting:
+            return None
+        return waiting[0], tuple(name for name in self._names if name not in self._pending[waiting[0]])
+
+    def clear(self) -> None:
+        """Forget what waits; stamps already taken stay passed."""
+        self._pending.clear()
+
+
+class Admission:
+    """The only entrance: numbers frames, holds W credits, and knows what is in flight.
+
+    Args:
+        credits: W, frames that may be in flight; each status returns one.
+    """
+
+    def __init__(self, credits: int) -> None:
+        self._credits = credits
+        self._in_flight: dict[int, None] = {}
+        self.last_stamp_ns = 0
+        self.seq = -1
+
+    @property
+    def in_flight(self) -> tuple[int, ...]:
+        """Stamps admitted and not answered, oldest first."""
+        return tuple(self._in_flight)
+
+    @property
+    def has_credit(self) -> bool:
+        """Whether another frame may enter now."""
+        return len(self._in_flight) < self._credits
+
+    def check(self, stamp_ns: int) -> None:
+        """Refuse a stamp that may not enter.
+
+        Raises:
+            FrameError: the stamp is zero, negative, or not later than that of the last admitted frame.
+        """
+        if stamp_ns <= 0:
+            raise FrameError(f"header.stamp must be positive, found {stamp_ns} ns: stamp images with the exposure time")
+        if stamp_ns <= self.last_stamp_ns:
+            raise FrameError(
+                f"header.stamp must increase, found {stamp_ns} ns after {self.last_stamp_ns} ns: "
+                f"the frame is a duplicate or out of order"
+            )
+
+    def admit(self, stamp_ns: int) -> int:
+        """Let a frame in and number it from 0; it takes one credit.
+
+        Raises:
+            FrameError: see :meth:`check`.
+        """
+        self.check(stamp_ns)
+        self.last_stamp_ns = stamp_ns
+        self.seq += 1
+        self._in_flight[stamp_ns] = None
+        return self.seq
+
+    def answered(self, stamp_ns: int) -> bool:
+        """Return the credit of a frame; False when it was not in flight (given up, or never ours)."""
+        if stamp_ns not in self._in_flight:
+            return False
+        del self._in_flight[stamp_ns]
+        return True
+
+    def give_up(self) -> tuple[int, ...]:
+        """Forget all frames in flight and return their stamps: a stage did not answer."""
+        lost = self.in_flight
+        self._in_flight.clear()
+        return lost
