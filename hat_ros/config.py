@@ -119,12 +119,47 @@ class FeatureSlamConfig:
 
 
 @dataclass(frozen=True)
+class DroidConfig:
+    """DROID-SLAM; distances are flow in units of 8 pixels of the resized image."""
+
+    input_area_px: int = option(196608, "image area after resizing, px (SwissCube: 393216)", low=4096, high=4194304)
+    device: str = option("auto", "auto (cuda if there is one), cpu, cuda or cuda:N")
+    precision: str = option(
+        "auto",
+        "of the networks: auto (float16 on cuda, float32 elsewhere), float32, float16 or bfloat16",
+        choices=("auto", "float32", "float16", "bfloat16"),
+    )
+    correlation: str = option(
+        "stored",
+        "stored volumes, or on_the_fly: less memory, more work",
+        choices=("stored", "on_the_fly"),
+    )
+    warmup_keyframes: int = option(8, "keyframes of the first bundle adjustment", low=5, high=64)
+    filter_threshold: float = option(2.4, "mean flow from the last keyframe that makes a new one", low=0)
+    keyframe_threshold: float = option(4.0, "a keyframe between two closer than twice this is removed", low=0)
+    beta: float = option(0.3, "share of the full motion in frame distances; the rest is translation", low=0, high=1)
+    frontend_threshold: float = option(16.0, "largest frame distance of a local edge", low=0)
+    frontend_window: int = option(25, "keyframes that local edges reach back", low=8, high=256)
+    frontend_radius: int = option(2, "neighbours in time that are always connected, less one", low=1, high=8)
+    frontend_nms: int = option(1, "edges keep others this far away in the plane of frame pairs", low=0, high=8)
+    motion_damping: float = option(0.0, "share of the last motion in the guess of the next pose", low=0, high=1)
+    readout_updates: int = option(3, "motion-only updates of the pose of a frame that is no keyframe", low=1, high=32)
+    published_back_substitution: bool = option(
+        True, "depths ignore the step of the first free pose, as in the released tracker; false: exact"
+    )
+    backend_threshold: float = option(22.0, "offline only: largest frame distance of a global edge", low=0)
+    backend_radius: int = option(2, "offline only: neighbours in time that are always connected, less one", low=1)
+    backend_nms: int = option(3, "offline only: suppression radius of global edges", low=0, high=8)
+
+
+@dataclass(frozen=True)
 class SlamConfig:
     """Target-relative motion."""
 
     backend: str = option("feature", "feature or droid")
     masked: bool = option(True, "suppress the background; false for a static scene seen by a moving camera")
     feature: FeatureSlamConfig = field(default_factory=FeatureSlamConfig)
+    droid: DroidConfig = field(default_factory=DroidConfig)
 
 
 @dataclass(frozen=True)
