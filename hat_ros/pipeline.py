@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from hat_ros import lie
 from hat_ros.bag import BagReader, deserialize
+from hat_ros.core.sync import Admission
 from hat_ros.datasets import Recording
 from hat_ros.datasets.sequence import load_sequence
 from hat_ros.errors import BagError, FrameError, UsageError
@@ -59,22 +60,6 @@ class Processed:
         return (self.latency_ms, self.decode_ms, *self.stage_ms.values(), self.mask_iou)
 
 
-class Admission:
-    """The entrance rule of DESIGN 5.1: stamps are positive and strictly increase; what is rejected is counted."""
-
-    def __init__(self) -> None:
-        self.last_stamp_ns = 0
-        self.rejected = 0
-
-    def admits(self, stamp_ns: int) -> bool:
-        """Whether a frame with this stamp enters; remembers it if so."""
-        if stamp_ns <= self.last_stamp_ns:
-            self.rejected += 1
-            return False
-        self.last_stamp_ns = stamp_ns
-        return True
-
-
 class StageClock:
     """Measures each stage of a method from outside, by wrapping the stage objects' ``update``."""
 
@@ -111,7 +96,8 @@ class Pipeline:
         self._method = method
         self._masks_given = masks_given
         self._clock = StageClock(method)
-        self.admission = Admission()
+        self._admission = Admission(credits=1)
+        self.rejected = 0
 
     @property
     def causal(self) -> bool:
@@ -119,17 +105,22 @@ class Pipeline:
         return self._method.causal
 
     def run(self, frames: Iterable[Frame | FrameError]) -> Iterator[Processed]:
-        """Process frames in order; rejected ones (late stamp, malformed) are counted in ``admission``."""
+        """Process frames in order; those with a late stamp or malformed are counted in ``rejected``."""
         iterator = iter(frames)
         while True:
             start = time.perf_counter()
             frame = next(iterator, None)
             if frame is None:
                 return
-            if isinstance(frame, FrameError):
-                self.admission.rejected += 1
-            elif self.admission.admits(frame.stamp_ns):
-                yield self._process(frame, 1e3 * (time.perf_counter() - start))
+            try:
+                if isinstance(frame, FrameError):
+                    raise frame
+                self._admission.admit(frame.stamp_ns)
+            except FrameError:
+                self.rejected += 1
+                continue
+            yield self._process(frame, 1e3 * (time.perf_counter() - start))
+            self._admission.answered(frame.stamp_ns)
 
     def finish(self, steps: list[Step]) -> list[Step]:
         """The collected steps with the answers of a method that gives them only after the last frame."""

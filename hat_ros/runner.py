@@ -119,14 +119,14 @@ def _run(
                 rows.append(done.measured())
                 if pipeline.causal:
                     tables.add(done.step.estimate, rows[-1])
-                    bag.write_step(done.step, pipeline.admission.rejected)
+                    bag.write_step(done.step, pipeline.rejected)
                 else:
                     steps.append(done.step)
                 if watch is not None:
                     watch(done, total)
             for step, row in zip(pipeline.finish(steps), rows[: len(steps)], strict=True):
                 tables.add(step.estimate, row)
-                bag.write_step(step, pipeline.admission.rejected)
+                bag.write_step(step, pipeline.rejected)
         finally:
             bag.write_context(source.recording.camera, source.truth_rows())
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

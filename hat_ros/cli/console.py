@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 STATE_STYLE = {"TRACKING": "green", "COASTING": "yellow", "LOST": "red", "UNINITIALISED": "dim"}
@@ -93,5 +93,20 @@ def campaign_progress(total: int) -> Iterator[Callable[[Any], None]]:
                 text += " (done before)" if outcome.reused else ""
             console.print(f"{outcome.job.name}: {text}", highlight=False)
             progress.advance(task)
+
+        yield watch
+
+
+@contextmanager
+def count_progress(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
+    """A bar per named item; yields what to call with (name, done, in all)."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=quiet) as progress:
+        tasks: dict[str, TaskID] = {}
+
+        def watch(name: str, done: int, total: int) -> None:
+            if name not in tasks:
+                tasks[name] = progress.add_task(name, total=total)
+            progress.update(tasks[name], completed=done)
 
         yield watch

@@ -1,9 +1,87 @@
-"""Commands of the group system."""
+"""``hat weights`` and ``hat doctor``: what is on this machine."""
 
 from __future__ import annotations
+
+import argparse
+from pathlib import Path
 
 from hat_ros.cli.options import Commands
 
 
 def add_commands(commands: Commands) -> None:
     """Register this group."""
+    _add_weights(commands)
+    _add_doctor(commands)
+
+
+def _add_weights(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "weights",
+        help="public network weights: list, check, convert",
+        description="What the learned backends need, whether it is here and unaltered, and the one-time conversion of "
+        "pickled checkpoints to safetensors. Nothing is ever downloaded.",
+    )
+    parser.add_argument(
+        "action",
+        choices=("list", "check", "convert"),
+        help="list: name, source, licence, place; check: presence and SHA-256; convert: pickled file to safetensors",
+    )
+    parser.add_argument("name", nargs="?", help="one checkpoint (default: all)")
+    parser.add_argument("--weights", type=Path, metavar="DIR", help="weights folder (default: $HAT_WEIGHTS)")
+    parser.add_argument("--source", type=Path, metavar="FILE", help="convert: the pickled file, if it lies elsewhere")
+    parser.set_defaults(command=_weights)
+
+
+def _weights(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+    from rich.table import Table
+
+    from hat_ros.errors import UsageError
+    from hat_ros.nets import checkpoint
+
+    names = [arguments.name] if arguments.name else list(checkpoint.CHECKPOINTS)
+    if arguments.action == "convert":
+        if not arguments.name:
+            raise UsageError("weights convert: name the checkpoint, `hat weights list` shows them")
+        print(checkpoint.convert(arguments.name, arguments.source, arguments.weights))
+        return 0
+    if arguments.action == "check":
+        found = [checkpoint.check(name, arguments.weights) for name in names]
+        for status in found:
+            print(f"{status.checkpoint.name}: {'ok' if status.usable else 'missing'}: {status.message}")
+        return 0 if all(status.usable for status in found) else 1
+    table = Table(title=f"weights folder: {checkpoint.weights_folder(arguments.weights)}")
+    for heading in ("name", "file below the folder", "size", "licence", "source", "SHA-256"):
+        table.add_column(heading, overflow="fold")
+    for entry in map(checkpoint.checkpoint_named, names):
+        table.add_row(entry.name, entry.filename, entry.size, entry.licence, entry.source, entry.sha256 or "-")
+    Console().print(table)
+    return 0
+
+
+def _add_doctor(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "doctor",
+        help="is everything here that a run needs?",
+        description="Check Python, packages, ROS, DDS, renderer, presets, cache and weights; exit code 1 if something "
+        "that the default preset needs is missing.",
+    )
+    parser.set_defaults(command=_doctor)
+
+
+def _doctor(_: argparse.Namespace) -> int:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from hat_ros.doctor import run_checks
+
+    findings = run_checks()
+    table = Table(title="hat doctor")
+    for heading in ("check", "", "found"):
+        table.add_column(heading, overflow="fold")
+    style = {"ok": "green", "missing": "red", "optional": "yellow"}
+    for finding in findings:
+        table.add_row(finding.what, Text(finding.verdict, style[finding.verdict]), Text(finding.found))
+    Console().print(table)
+    return 1 if any(finding.verdict == "missing" for finding in findings) else 0
