@@ -16,6 +16,8 @@ _NO_DISTANCE = np.zeros((2, 2), np.float32)
 _NO_ORIGIN = np.zeros(2)
 # A contour point agrees with the image when its edge or the mask's boundary lies this close, pixels.
 _AGREE_PX = 2.5
+# Damping while only the mask's outline is known and the start is far off.
+_PULL_DAMPING = 1e-3
 
 
 @dataclass(frozen=True)
@@ -25,11 +27,12 @@ class Schedule:
     reach: tuple[float, ...]
     edge: tuple[float, ...]
     mask: tuple[float, ...]
+    damping: float = 1e-3
 
 
 # The mask leads the way, then the image's own edges take over; without a mask long lines lead the way.
 WITH_MASK = (
-    Schedule((0, 0, 0, 0), (1, 1, 1, 1), (12, 8, 5, 4)),
+    Schedule((0, 0, 0, 0), (1, 1, 1, 1), (12, 8, 5, 4), damping=1e-2),
     Schedule((0, 0, 4, 4), (1, 1, 2, 2), (4, 3, 2, 2)),
     Schedule((4, 3.5, 3), (1.5, 1.5, 1.5), (1.5, 1.5, 1.5)),
 )
@@ -46,10 +49,9 @@ class Fit:
 
     Attributes:
         T_cam_target: (4, 4).
-        information: (6, 6) of ``[dt; r]``, one pixel of contour counted as one independent sample.
+        information: (8, 8) lower triangle, of ``[dt; r; mask bias; edge bias]``.
         contour: (N, 5) as returned by the solver.
         lines: (N, 5) of the contour it belongs to.
-        view: the rendering at the end (None if it was not rendered).
     """
 
     T_cam_target: NDArray[np.float64]
@@ -121,6 +123,7 @@ class PoseFitter:
             field.origin_px,
             scales_px,
             off,
+            np.full(len(scales_px), _PULL_DAMPING),
             self.viewer.target.bounding_radius_m,
         )
         return lie.transform(R, t)
@@ -138,6 +141,7 @@ class PoseFitter:
             _NO_ORIGIN if field is None else field.origin_px,
             np.array(schedule.mask, dtype=np.float64),
             np.array(schedule.edge, dtype=np.float64),
+            np.full(len(schedule.reach), schedule.damping),
             self.viewer.target.bounding_radius_m,
         )
         return Fit(lie.transform(R, t), H, contour, lines.lines)

@@ -12,12 +12,21 @@ from numba import njit
 
 # Lines with less free target or background than this have no colour of their own to compare.
 MIN_REACH_PX = 2.0
-# Contrast in grey levels at which an edge counts half.
-CONTRAST_REF = 20.0
+# Grey levels that noise and compression put on a line; contrast is judged against it.
+NOISE_LEVEL = 4.0
+# Scatter of a line about its step, in squared contrasts, at which an edge counts half.
+SCATTER_REF = 0.04
 # Neither masks nor edges are trusted beyond a quarter of a pixel.
 VARIANCE_FLOOR_PX2 = 0.0625
-# Share of the mean information that is added in every direction.
-DAMPING = 1e-3
+# Contour length over which residuals err together, pixels: one independent sample each.
+CORRELATION_PX = 8.0
+# Errors common to a whole outline, one sigma in pixels: a mask drawn too large, an exposure that blooms. They are
+# estimated along with the pose.
+MASK_BIAS_PX = 1.0
+EDGE_BIAS_PX = 0.15
+# Pose parameters, then the two biases.
+N_PARAMETERS = 8
+MASK_BIAS, EDGE_BIAS = 6, 7
 
 
 @njit(cache=True)
@@ -73,7 +82,7 @@ def rotation_exp(r):
 
 @njit(cache=True)
 def _update_pose(R, t, step):
-    dR = rotation_exp(step[3:])
+    dR = rotation_exp(step[3:6])
     out = np.zeros((3, 3))
     for i in range(3):
         for j in range(3):
@@ -97,22 +106,26 @@ def _normal_row(x, y, z, tx, ty, tz, fx, fy, nu, nv, row):
 
 @njit(cache=True)
 def _accumulate(H, g, row, weight, residual):
-    for i in range(6):
+    """Add one weighted residual with derivative row to the normal equations (lower triangle)."""
+    for i in range(len(row)):
         g[i] -= weight * row[i] * residual
         for j in range(i + 1):
             H[i, j] += weight * row[i] * row[j]
 
 
 @njit(cache=True)
-def _damped_solve(H, g, damping_t, damping_r):
-    A = np.empty((6, 6))
-    for i in range(6):
+def _damped_solve(H, g, damping, radius_m):
+    """Step of the pose and the biases; damping is a share of the mean translational information."""
+    n = len(g)
+    A = np.empty((n, n))
+    for i in range(n):
         for j in range(i + 1):
             A[i, j] = H[i, j]
             A[j, i] = H[i, j]
+    level = (H[0, 0] + H[1, 1] + H[2, 2]) / 3.0 * damping + 1e-12
     for i in range(3):
-        A[i, i] += damping_t
-        A[i + 3, i + 3] += damping_r
+        A[i, i] += level
+        A[i + 3, i + 3] += level * radius_m * radius_m
     return cholesky_solve(A, g)
 
 
@@ -142,14 +155,15 @@ def _sample(image, u, v, out):
 
 
 @njit(cache=True)
-def edge_offset(image, u, v, nu, nv, reach_in, reach_out, step, profile):
+def edge_offset(image, u, v, nu, nv, reach_in, reach_out, step, profile, levels):
     """Where the image's own edge lies along an outward normal.
 
     The colours at both ends of the line are taken for target and background; the edge is the crossing of their half
     level nearest to the present contour.
 
     Returns:
-        offset in pixels (positive outwards), contrast in grey levels (root mean square over channels; 0 = no edge).
+        offset in pixels (positive outwards), and how much it counts, 0 (no edge) to 1: contrast against noise, and how
+        much like a step the line looks.
     """
     n_in, n_out = int(reach_in / step), int(reach_out / step)
     n = n_in + n_out + 1
@@ -167,22 +181,29 @@ def edge_offset(image, u, v, nu, nv, reach_in, reach_out, step, profile):
     if contrast_sq < 1e-6:
         return 0.0, 0.0
     best, found = 1e9, False
-    previous = 0.0
     for k in range(n):
         level = 0.0
         for c in range(3):
             f = 0.5 * (profile[0, c] + profile[1, c])
             b = 0.5 * (profile[n - 1, c] + profile[n - 2, c])
             level += (profile[k, c] - b) * (f - b)
-        level /= contrast_sq
-        if k > 0 and previous >= 0.5 > level:
-            o = (k - 1 - n_in + (previous - 0.5) / (previous - level)) * step
+        levels[k] = level / contrast_sq
+        if k > 0 and levels[k - 1] >= 0.5 > levels[k]:
+            o = (k - 1 - n_in + (levels[k - 1] - 0.5) / (levels[k - 1] - levels[k])) * step
             if abs(o) < abs(best):
                 best, found = o, True
-        previous = level
     if not found:
         return 0.0, 0.0
-    return best, np.sqrt(contrast_sq / 3.0)
+    scatter, count = 0.0, 0
+    for k in range(n):
+        o = (k - n_in) * step - best
+        if abs(o) > 1.0:  # the edge itself is blurred
+            deviation = levels[k] - (1.0 if o < 0 else 0.0)
+            scatter += deviation * deviation
+            count += 1
+    scatter = scatter / count if count > 0 else 0.0
+    noise = 3.0 * NOISE_LEVEL * NOISE_LEVEL / contrast_sq
+    return best, 1.0 / (1.0 + scatter / SCATTER_REF + noise)
 
 
 @njit(cache=True)
@@ -192,7 +213,7 @@ def _mean_square(total, weight, floor):
 
 
 @njit(cache=True)
-def fit_contour(points, lines, R, t, K, image, reaches_px, distance, origin, mask_scales_px, edge_scales_px, radius_m):
+def fit_contour(points, lines, R, t, K, image, reaches_px, distance, origin, mask_scales_px, edge_scales_px, dampings, radius_m):
     """Fit contour points to a mask's boundary and to the image's own edges, each weighted by its measured variance.
 
     Args:
@@ -206,23 +227,27 @@ def fit_contour(points, lines, R, t, K, image, reaches_px, distance, origin, mas
         origin: (2,) image position of its pixel (0, 0).
         mask_scales_px: (I,) robust scale of the mask residuals in each iteration, 0 = mask unused.
         edge_scales_px: (I,) robust scale of the edge residuals.
+        dampings: (I,) share of the mean information added in every direction, so that what cannot be observed stays.
         radius_m: bounding radius of the target, which makes rotations and translations commensurate.
 
     Returns:
-        R, t, information H (6, 6) of the last iteration before its step (pixels of contour as independent samples),
-        and per point (N, 5): in the image (0/1), mask distance, its robust weight, edge offset, its weight
-        (0 where no edge was found).
+        R, t, information (8, 8) of pose, mask bias and edge bias in the last iteration, before its step, and per point
+        (N, 5): in the image (0/1), mask distance, its robust weight, edge offset, its weight (0 = no edge found).
     """
     n = len(points)
-    row, mask_at, profile = np.empty(6), np.empty(3), np.empty((64, 3))
+    row, mask_at = np.zeros(N_PARAMETERS), np.empty(3)
+    profile, levels = np.empty((64, 3)), np.empty(64)
     state = np.zeros((n, 5))
     height, width = image.shape[0], image.shape[1]
-    H = np.zeros((6, 6))
+    shape = (N_PARAMETERS, N_PARAMETERS)
+    H = np.zeros(shape)
+    mask_bias, edge_bias = 0.0, 0.0
     for iteration in range(len(reaches_px)):
         mask_sq, edge_sq = mask_scales_px[iteration] ** 2, edge_scales_px[iteration] ** 2
         reach = reaches_px[iteration]
         spacing = max(reach / 8.0, 0.5)
-        H_mask, g_mask, H_edge, g_edge = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6)), np.zeros(6)
+        H_mask, g_mask = np.zeros(shape), np.zeros(N_PARAMETERS)
+        H_edge, g_edge = np.zeros(shape), np.zeros(N_PARAMETERS)
         mask_sum, mask_weight, edge_sum, edge_weight = 0.0, 0.0, 0.0, 0.0
         state[:] = 0.0
         for i in range(n):
@@ -238,11 +263,12 @@ def fit_contour(points, lines, R, t, K, image, reaches_px, distance, origin, mas
             state[i, 0] = 1.0
             if mask_sq > 0.0:
                 _mask_distance(distance, u - origin[0], v - origin[1], mask_at)
-                residual = mask_at[0]
+                residual = mask_at[0] - mask_bias
                 robust = (mask_sq / (mask_sq + residual * residual)) ** 2
                 weight = lines[i, 2] * robust
-                state[i, 1], state[i, 2] = residual, robust
+                state[i, 1], state[i, 2] = mask_at[0], robust
                 _normal_row(x, y, z, t[0], t[1], t[2], K[0, 0], K[1, 1], mask_at[1], mask_at[2], row)
+                row[MASK_BIAS], row[EDGE_BIAS] = -1.0, 0.0
                 _accumulate(H_mask, g_mask, row, weight, residual)
                 mask_sum += weight * residual * residual
                 mask_weight += weight
@@ -250,25 +276,30 @@ def fit_contour(points, lines, R, t, K, image, reaches_px, distance, origin, mas
             if inside < MIN_REACH_PX or outside < MIN_REACH_PX:
                 continue
             nu, nv = lines[i, 0], lines[i, 1]
-            offset, contrast = edge_offset(image, u, v, nu, nv, inside, outside, spacing, profile)
-            if contrast <= 0.0:
+            offset, quality = edge_offset(image, u, v, nu, nv, inside, outside, spacing, profile, levels)
+            if quality <= 0.0:
                 continue
-            robust = (edge_sq / (edge_sq + offset * offset)) ** 2
-            robust *= contrast * contrast / (contrast * contrast + CONTRAST_REF**2)
+            residual = -offset - edge_bias
+            robust = quality * (edge_sq / (edge_sq + residual * residual)) ** 2
             weight = lines[i, 2] * robust
             state[i, 3], state[i, 4] = offset, robust
             _normal_row(x, y, z, t[0], t[1], t[2], K[0, 0], K[1, 1], nu, nv, row)
-            _accumulate(H_edge, g_edge, row, weight, -offset)
-            edge_sum += weight * offset * offset
+            row[MASK_BIAS], row[EDGE_BIAS] = 0.0, -1.0
+            _accumulate(H_edge, g_edge, row, weight, residual)
+            edge_sum += weight * residual * residual
             edge_weight += weight
-        mask_info = 1.0 / _mean_square(mask_sum, mask_weight, VARIANCE_FLOOR_PX2)
-        edge_info = 1.0 / _mean_square(edge_sum, edge_weight, VARIANCE_FLOOR_PX2)
+        mask_info = 1.0 / (_mean_square(mask_sum, mask_weight, VARIANCE_FLOOR_PX2) * CORRELATION_PX)
+        edge_info = 1.0 / (_mean_square(edge_sum, edge_weight, VARIANCE_FLOOR_PX2) * CORRELATION_PX)
         H = mask_info * H_mask + edge_info * H_edge
         g = mask_info * g_mask + edge_info * g_edge
-        # A thousandth of the mean information keeps unobservable directions where they are.
-        level = (H[0, 0] + H[1, 1] + H[2, 2]) / 3.0 * DAMPING + 1e-12
-        ok, step = _damped_solve(H, g, level, level * radius_m * radius_m)
+        H[MASK_BIAS, MASK_BIAS] += 1.0 / MASK_BIAS_PX**2
+        H[EDGE_BIAS, EDGE_BIAS] += 1.0 / EDGE_BIAS_PX**2
+        g[MASK_BIAS] -= mask_bias / MASK_BIAS_PX**2
+        g[EDGE_BIAS] -= edge_bias / EDGE_BIAS_PX**2
+        ok, step = _damped_solve(H, g, dampings[iteration], radius_m)
         if not ok:
             break
         R, t = _update_pose(R, t, step)
+        mask_bias += step[MASK_BIAS]
+        edge_bias += step[EDGE_BIAS]
     return R, t, H, state
