@@ -16,6 +16,8 @@ from hat_ros.types import Estimate, Float, PosePrior, TrackState
 
 # Past poses behind one extrapolation: enough for the medians, short enough for a constant rate.
 HISTORY_FRAMES = 8
+# A larger turn between two frames is a reset: anchors only replace a track from beyond the gate (D, 30 degrees).
+JUMP_DEG = 25.0
 # Frames that a stage may have admitted beyond the one it asks about; they must not push history out.
 _IN_FLIGHT_FRAMES = 64
 
@@ -80,13 +82,21 @@ class PriorBuffer:
 
 
 def _unbroken_run(past: list[Estimate | None]) -> list[Estimate]:
-    """The newest estimates, oldest first, that belong to one continuous track: poses all along and no reset between."""
+    """The newest estimates, oldest first, that belong to one continuous track: poses all along and no jump between.
+
+    A reset shows as a jump of the pose, which ``/hat/status`` carries; the count of resets it does not.
+    """
     run = [past[-1]]
     for estimate in reversed(past[:-1]):
-        if estimate is None or not estimate.state.has_pose or estimate.n_resets != run[-1].n_resets:
+        if estimate is None or not estimate.state.has_pose or _jumps(estimate, run[-1]):
             break
         run.append(estimate)
     return run[::-1]
+
+
+def _jumps(a: Estimate, b: Estimate) -> bool:
+    """Whether no target turns that far from one frame to the next."""
+    return bool(lie.angle_between(a.T_cam_target[:3, :3], b.T_cam_target[:3, :3]) > np.radians(JUMP_DEG))
 
 
 def extrapolate(stamps_ns: np.ndarray, T_cam_target: Float, stamp_ns: int) -> Float:

@@ -40,10 +40,10 @@ class ExactJoin:
             return
         self._pending.setdefault(stamp_ns, {})[name] = item
 
-    def peek(self) -> int | None:
-        """Stamp of the earliest complete set, None when there is none."""
+    def peek(self) -> tuple[int, dict[str, Any]] | None:
+        """Stamp and items of the earliest complete set, None when there is none; it stays."""
         complete = [stamp for stamp, items in self._pending.items() if len(items) == len(self._names)]
-        return min(complete, default=None)
+        return (min(complete), self._pending[min(complete)]) if complete else None
 
     def take(self) -> tuple[int, dict[str, Any]]:
         """Remove the earliest complete set and everything before it.
@@ -51,10 +51,11 @@ class ExactJoin:
         Raises:
             LookupError: there is none; ask :meth:`peek` first.
         """
-        stamp_ns = self.peek()
-        if stamp_ns is None:
+        head = self.peek()
+        if head is None:
             raise LookupError("no complete set to take")
-        items = self._pending.pop(stamp_ns)
+        stamp_ns, items = head
+        del self._pending[stamp_ns]
         for stamp in [stamp for stamp in self._pending if stamp < stamp_ns]:
             del self._pending[stamp]
             self.abandoned += 1
