@@ -15,12 +15,14 @@ from typing import Any, Protocol
 import numpy as np
 
 from hat_ros.config import HatConfig
+from hat_ros.core.refiner import Refiner
 from hat_ros.errors import UsageError
 from hat_ros.hypotheses.stage import HypothesisStage
+from hat_ros.refinement import create_refiner
 from hat_ros.segmentation.stage import SegmentationStage
 from hat_ros.target import Target
 from hat_ros.tracker import HatTracker, Step
-from hat_ros.types import Candidates, Detection, Estimate, Frame, Motion, Selection, TrackState
+from hat_ros.types import Candidates, Detection, Estimate, Frame, Motion, Refined, Selection, TrackState
 
 MODES = ("hat", "independent", "tracking", "offline")
 
@@ -53,7 +55,7 @@ def create_method(mode: str, config: HatConfig, target: Target) -> Method:
         UsageError: unknown mode.
         ConfigError: the configuration names an unknown backend.
     """
-    methods = {"hat": Hat, "independent": Independent}
+    methods = {"hat": Hat, "independent": Independent, "tracking": Tracking}
     if mode not in methods:
         raise UsageError(f"mode '{mode}' is unknown, choose one of {', '.join(MODES)}")
     return methods[mode](config, target)
@@ -100,6 +102,63 @@ class Independent:
     def finish(self) -> list[Estimate]:
         """Nothing: every answer is final."""
         return []
+
+
+class Tracking:
+    """The previous pose, refined on each image; the best appearance where there is no track to follow."""
+
+    causal = True
+
+    def __init__(self, config: HatConfig, target: Target) -> None:
+        config = replace(
+            config,
+            keyframes=replace(config.keyframes, gap_frames=1),
+            refinement=replace(config.refinement, enabled=True),
+        )
+        self._segmentation = SegmentationStage(config, target)
+        self._hypotheses = HypothesisStage(config, target)
+        self._refinement = _LastPose(create_refiner(config, target))
+        self.stages = {
+            "segmentation": self._segmentation,
+            "hypotheses": self._hypotheses,
+            "fusion": self._refinement,
+        }
+
+    def step(self, frame: Frame) -> Step:
+        """Follow, or start afresh."""
+        detection = self._segmentation.update(frame, None)
+        refined = self._refinement.update(frame, detection)
+        if refined is not None:
+            estimate = Estimate(frame.stamp_ns, TrackState.TRACKING, refined.pose_row, refined.covariance)
+            return _step(detection, Candidates.none(), estimate)
+        candidates = self._hypotheses.update(frame, detection, None)
+        estimate = _best_appearance(frame, candidates)
+        self._refinement.start(estimate)
+        return _step(detection, candidates, estimate)
+
+    def finish(self) -> list[Estimate]:
+        """Nothing: every answer is final."""
+        return []
+
+
+class _LastPose:
+    """The track of :class:`Tracking`."""
+
+    def __init__(self, refiner: Refiner) -> None:
+        self._refiner = refiner
+        self._T_cam_target: np.ndarray | None = None
+
+    def start(self, estimate: Estimate) -> None:
+        """Follow this pose from the next frame on."""
+        self._T_cam_target = estimate.T_cam_target if estimate.state.has_pose else None
+
+    def update(self, frame: Frame, detection: Detection | None) -> Refined | None:
+        """The last pose refined on this image; None when there is no track or it is lost here."""
+        if self._T_cam_target is None:
+            return None
+        refined = self._refiner.refine(frame, detection, self._T_cam_target)
+        self._T_cam_target = None if refined is None else refined.T_cam_target
+        return refined
 
 
 def _best_appearance(frame: Frame, candidates: Candidates) -> Estimate:

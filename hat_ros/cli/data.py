@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import tempfile
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hat_ros.cli.options import Commands, natural, positive
 
 if TYPE_CHECKING:
-    from hat_ros.datasets.synth import ClipSpec
+    from hat_ros.datasets.suite import Clip
 
 FORMATS = ("sequence", "spark", "shirt", "swisscube", "bop")
 
@@ -71,53 +69,79 @@ def _add_synth(commands: Commands) -> None:
     parser = commands.add_parser(
         "synth",
         help="a clip rendered from a CAD model, with exact truth",
-        description="Render a clip of a tumbling spacecraft in sunlight and write it in the `sequence` layout.",
+        description="Render a tumbling spacecraft in sunlight. WHAT is a CAD file in metres, one of our own models, a "
+        "named clip (its settings are fixed), `suite` (all clips of the synthetic benchmark), or `list`.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    parser.add_argument("model", metavar="MODEL", help="CAD file (metres), or one of our own: see `hat synth list`")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="clip folder to write")
-    parser.add_argument("--frames", type=positive, default=200, help="number of frames, 0.1 s apart")
-    parser.add_argument("--size", type=positive, nargs=2, default=(640, 480), metavar=("W", "H"), help="image size, px")
-    parser.add_argument("--focal", type=float, default=1000.0, metavar="PX", help="focal length, px")
+    parser.add_argument("what", metavar="WHAT", help="CAD file, model, clip, `suite` or `list`")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="what to write; for `suite` the folder of all bags")
     parser.add_argument(
+        "--format", choices=("bag", "sequence"), default="bag", help="rosbag2 folder or images + labels"
+    )
+    parser.add_argument("--scale", type=float, default=1.0, metavar="S", help="image size of clips and suite, times S")
+    parser.add_argument("--limit", type=positive, metavar="N", help="at most N frames per clip of the suite")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    film = parser.add_argument_group("how a model is filmed")
+    film.add_argument("--frames", type=positive, default=200, help="number of frames, 0.1 s apart")
+    film.add_argument("--size", type=positive, nargs=2, default=(640, 480), metavar=("W", "H"), help="image size, px")
+    film.add_argument("--focal", type=float, default=1000.0, metavar="PX", help="focal length, px")
+    film.add_argument(
         "--range", type=float, nargs=2, default=(12.0, 6.0), metavar=("FIRST", "LAST"), help="distance, m"
     )
-    parser.add_argument("--spin", type=float, default=1.0, metavar="DEG", help="rotation rate, degrees per frame")
-    parser.add_argument("--precession", type=float, default=0.0, metavar="DEG", help="rate of the spin axis, deg/frame")
-    parser.add_argument(
+    film.add_argument("--spin", type=float, default=1.0, metavar="DEG", help="rotation rate, degrees per frame")
+    film.add_argument("--precession", type=float, default=0.0, metavar="DEG", help="rate of the spin axis, deg/frame")
+    film.add_argument(
         "--axis", type=float, nargs=3, default=(0.3, 0.2, 1.0), metavar=("X", "Y", "Z"), help="spin axis, target frame"
     )
-    parser.add_argument(
-        "--sun",
-        type=float,
-        nargs=3,
-        default=(-1.0, -0.8, -1.0),
-        metavar=("X", "Y", "Z"),
-        help="to the sun, camera frame",
+    film.add_argument(
+        "--sun", type=float, nargs=3, default=(-1.0, -0.8, -1.0), metavar=("X", "Y", "Z"), help="to the sun, camera"
     )
-    parser.add_argument("--exposure", type=float, default=0.85, help="brightness of a white face square to the sun")
-    parser.add_argument("--noise", type=float, default=0.0008, help="read noise, share of full scale")
-    parser.add_argument("--stars", type=natural, default=0, metavar="N", help="stars in the field")
-    parser.add_argument("--background", choices=("black", "earth", "table"), default="black", help="behind the target")
-    parser.add_argument(
+    film.add_argument("--exposure", type=float, default=0.85, help="brightness of a white face square to the sun")
+    film.add_argument("--noise", type=float, default=0.0008, help="read noise, share of full scale")
+    film.add_argument("--stars", type=natural, default=0, metavar="N", help="stars in the field")
+    film.add_argument("--background", choices=("black", "earth", "table"), default="black", help="behind the target")
+    film.add_argument(
         "--asymmetry", type=float, default=1.0, metavar="0..1", help="of our own models; 0 makes them ambiguous"
     )
-    parser.add_argument("--seed", type=natural, default=0, help="of noise, stars and textures")
-    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    film.add_argument("--seed", type=natural, default=0, help="of noise, stars and textures")
     parser.set_defaults(command=_synth)
 
 
 def _synth(arguments: argparse.Namespace) -> int:
+    from hat_ros.cli.console import count_progress
+    from hat_ros.datasets import suite
+    from hat_ros.datasets.models import model_names
+    from hat_ros.errors import UsageError
+
+    what = arguments.what
+    if what == "list":
+        print(f"models: {', '.join(model_names())}\nclips: {', '.join(suite.CLIPS)}")
+        return 0
+    if arguments.out is None:
+        raise UsageError("synth: --out is missing; it names what to write")
+    with count_progress(arguments.quiet) as watch:
+        if what == "suite":
+            groups = suite.write_suite(arguments.out, scale=arguments.scale, limit=arguments.limit, progress=watch)
+            written = [bag for bags in groups.values() for bag in bags]
+        else:
+            clip = suite.CLIPS[what].scaled(arguments.scale) if what in suite.CLIPS else _filmed(arguments)
+            written = [suite.synthesize(clip, arguments.out, arguments.format == "bag", watch)]
+    for path in written:
+        print(path)
+    return 0
+
+
+def _filmed(arguments: argparse.Namespace) -> Clip:
+    """The clip that the options describe."""
     from hat_ros.datasets.backdrop import Earth
     from hat_ros.datasets.models import model_names
+    from hat_ros.datasets.suite import CLIPS, Clip
     from hat_ros.datasets.synth import ClipSpec
     from hat_ros.errors import UsageError
 
-    if arguments.model == "list":
-        print("\n".join(model_names()))
-        return 0
-    if arguments.out is None:
-        raise UsageError("synth: --out is missing; it names the clip folder to write")
+    if arguments.what not in model_names() and not Path(arguments.what).is_file():
+        known = ", ".join((*model_names(), *CLIPS))
+        raise UsageError(f"synth: '{arguments.what}' is neither a CAD file nor one of {known}, suite, list")
     spec = ClipSpec(
         frames=arguments.frames,
         width=arguments.size[0],
@@ -135,20 +159,4 @@ def _synth(arguments: argparse.Namespace) -> int:
         table=arguments.background == "table",
         seed=arguments.seed,
     )
-    print(_render(arguments, spec))
-    return 0
-
-
-def _render(arguments: argparse.Namespace, spec: ClipSpec) -> Path:
-    """Render a clip of one of our own models or of a CAD file."""
-    from hat_ros.cli.console import count_progress
-    from hat_ros.datasets.models import model_names, write_model
-    from hat_ros.datasets.synth import write_clip
-    from hat_ros.target import load_target
-
-    with tempfile.TemporaryDirectory() as folder, count_progress(arguments.quiet) as watch:
-        model = Path(arguments.model)
-        if arguments.model in model_names():
-            model = Path(folder) / f"{arguments.model}.glb"
-            write_model(arguments.model, model, arguments.asymmetry)
-        return write_clip(load_target(model), model, arguments.out, spec, progress=partial(watch, model.stem))
+    return Clip(arguments.what, spec, arguments.asymmetry)

@@ -13,6 +13,7 @@ MODES = ("hat", "independent", "tracking", "offline")
 def add_commands(commands: Commands) -> None:
     """Register this group."""
     _add_track(commands)
+    _add_temporal(commands)
 
 
 def _add_track(commands: Commands) -> None:
@@ -58,4 +59,26 @@ def _track(arguments: argparse.Namespace) -> int:
         folder = track(arguments.recording, arguments.out, config_of(arguments), options, watch)
     if not arguments.quiet:
         print_figures(folder)
+    return 0
+
+
+def _add_temporal(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "temporal",
+        help="stages 3 and 4 alone over recorded observations",
+        description="Run selection, alignment and fusion over an .npz file with slam (N,4,4) T_slam_cam (NaN = none), "
+        "key (N,) bool, poses (N,K,4,4) T_cam_target, scores (N,K) and optionally box_area_px (N,). "
+        "Writes T_cam_target (N,4,4), chosen (N,), accepted (N,) and resets.",
+    )
+    parser.add_argument("observations", type=Path, metavar="OBS.npz", help="recorded observations")
+    parser.add_argument("--out", required=True, type=Path, metavar="OUT.npz", help="file to write")
+    add_config(parser)
+    parser.set_defaults(command=_temporal)
+
+
+def _temporal(arguments: argparse.Namespace) -> int:
+    from hat_ros.temporal import load_observations, run_temporal, save_result
+
+    config = config_of(arguments)
+    save_result(arguments.out, run_temporal(load_observations(arguments.observations), config))
     return 0
