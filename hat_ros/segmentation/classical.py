@@ -32,9 +32,12 @@ _MAX_AREA_CHANGE = 1.6  # from one frame to the next
 _MIN_CONTINUITY = 0.6  # overlap of a tracked mask with its seed
 _MIN_CONTRAST = 8.0  # 8-bit colour step across the outline below which there is no outline
 _AGREEMENT = 0.8  # overlap of two independent masks that mean the same
-_CLEARLY_BETTER = 0.02  # shape overlap by which one explanation must beat the simpler one
+_CLEARLY_BETTER = 0.025  # shape overlap by which one explanation must beat the simpler one
 _SECOND_REGION_SHARE = 0.2  # a second bright region this large makes the choice between them a question
+_WHOLE_SHARE = 0.6  # of the body's area is lit: what is dark then is left out
+_SCATTERED_GAIN = 0.1  # shape overlap that bridging the gaps between lit parts must bring
 _MAX_RETRY_FRAMES = 8
+_CHECK_UNAIDED_FRAMES = 3  # frames between checks of a mask that no prior holds in place
 
 
 @dataclass(frozen=True)
@@ -119,14 +122,28 @@ class ClassicalSegmenter:
         sizes = np.array([np.count_nonzero(r) for r in regions])
         main = 0
         silhouette = self._silhouette(frame, prior)
-        if len(regions) > 1 and sizes[1] >= _SECOND_REGION_SHARE * sizes[0] or sky.touches_border(regions[0]):
+        if (len(regions) > 1 and sizes[1] >= _SECOND_REGION_SHARE * sizes[0]) or sky.touches_border(regions[0]):
             main = self._choose_region(regions, sizes, silhouette)
             if main is None:
                 return self._before_texture(frame, prior)
-        mask = sky.join_parts(regions, main)
-        if silhouette is not None and self._explains(silhouette, mask):
-            mask |= silhouette
-        return mask
+        lit = sky.join_parts(regions, main)
+        body = self._complete(measured, lit)
+        if silhouette is not None and _explains(silhouette, lit, body):
+            return lit | _shadowed(silhouette, lit)
+        return body
+
+    def _complete(self, measured: sky.Sky, lit: Mask) -> Mask:
+        """The body of which ``lit`` are the lit parts: ``lit`` itself unless it is scattered over a CAD silhouette."""
+        options = sky.bridge_gaps(measured, lit, self._config.work_side_px)
+        if np.count_nonzero(options[0]) >= _WHOLE_SHARE * np.count_nonzero(options[-2]):
+            return lit
+        shapes = [self._bank.overlap(option) for option in options]
+        best = int(np.argmax(shapes))
+        if shapes[best] < shapes[0] + _SCATTERED_GAIN:
+            return lit
+        size = (lit.shape[1], lit.shape[0])
+        large = cv2.resize(options[best].astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR)
+        return lit | (large > 127).astype(np.uint8)
 
     def _choose_region(self, regions: list[Mask], sizes: NDArray[np.int64], silhouette: Mask | None) -> int | None:
         """Which bright region is the target: the one that is where it was, or else the one with its shape."""
@@ -142,22 +159,18 @@ class ClassicalSegmenter:
             return None
         return best
 
-    def _explains(self, silhouette: Mask, lit: Mask) -> bool:
-        """Whether nearly all that is lit lies inside the predicted silhouette, so that the rest of it is shadow."""
-        shared = np.count_nonzero(silhouette & lit)
-        return shared >= 0.95 * np.count_nonzero(lit) and shared >= 0.5 * np.count_nonzero(silhouette)
-
     # Anything else ---------------------------------------------------------------------------------------------
 
     def _before_texture(self, frame: Frame, prior: PosePrior | None) -> Mask | None:
         if self._mask is not None:
-            tracked = self._track(frame, prior)
+            tracked, aided = self._track(frame, prior)
             self._since_check += 1
-            if tracked is not None and self._since_check < self._config.check_interval_frames:
+            interval = self._config.check_interval_frames if aided else _CHECK_UNAIDED_FRAMES
+            if tracked is not None and self._since_check < interval:
                 return tracked
             if tracked is not None:
                 self._since_check = 0
-                return self._cross_check(frame, tracked)
+                return self._cross_check(frame, tracked, aided)
         if self._wait > 0:
             self._wait -= 1
             return None
@@ -170,8 +183,12 @@ class ClassicalSegmenter:
         self._since_check = 0
         return found[0]
 
-    def _track(self, frame: Frame, prior: PosePrior | None) -> Mask | None:
-        """Follow the previous mask into this frame, helped by the predicted silhouette while the two agree."""
+    def _track(self, frame: Frame, prior: PosePrior | None) -> tuple[Mask | None, bool]:
+        """Follow the previous mask into this frame; the predicted silhouette helps while the two agree.
+
+        Returns:
+            The mask, None when it was lost, and whether the prediction helped.
+        """
         assert self._mask is not None
         dx, dy = (int(v) for v in np.rint(self._velocity_xy))
         x, y, w, h = cv2.boundingRect(self._mask)
@@ -185,30 +202,34 @@ class ClassicalSegmenter:
             box = (min(box[0], u), min(box[1], v), max(box[2], u + a), max(box[3], v + b))
         else:
             silhouette = None
+        aided = silhouette is not None
         margin = _MARGIN_PX + _MARGIN_SHARE * max(w, h)
         window = self._window(frame, box, 2.5 * margin)
         if window is None:
-            return None
+            return None, aided
         seeds = [window.reduce(self._mask, (dx, dy))]
         if silhouette is not None:
             seeds.insert(0, window.reduce(silhouette))
         cut = region.cut_from_seeds(window.rgb, seeds, margin * window.scale)
         if cut is None:
-            return None
+            return None, aided
         grown = np.count_nonzero(cut) / max(1, np.count_nonzero(seeds[-1]))
         if not 1 / _MAX_AREA_CHANGE <= grown <= _MAX_AREA_CHANGE or _overlap(cut, seeds[0]) < _MIN_CONTINUITY:
-            return None
+            return None, aided
         if region.edge_contrast(window.rgb, cut) < _MIN_CONTRAST:
-            return None
-        return self._finish(frame, window, cut)
+            return None, aided
+        return self._finish(frame, window, cut), aided
 
-    def _cross_check(self, frame: Frame, tracked: Mask) -> Mask | None:
-        """Compare a tracked mask with what a search from nothing finds; keep the one that the CAD can explain."""
+    def _cross_check(self, frame: Frame, tracked: Mask, aided: bool) -> Mask | None:
+        """Compare a tracked mask with what a search from nothing finds; keep the one that the CAD explains better.
+
+        A mask held in place by a prediction is given up only for one that means something else.
+        """
         found = self._search(frame, _touched_sides(tracked))
-        if found is not None and _overlap(found[0], tracked) >= _AGREEMENT:
+        if found is not None and aided and _overlap(found[0], tracked) >= _AGREEMENT:
             return tracked
         shape = self._bank.overlap(_shrink(tracked))
-        if found is not None and found[1] > shape + _CLEARLY_BETTER:
+        if found is not None and found[1] > shape + (_CLEARLY_BETTER if aided else 0.0):
             return found[0]
         return tracked if shape >= self._config.min_shape_overlap else None
 
@@ -296,6 +317,20 @@ def _moved(mask: Mask, dx: int, dy: int) -> Mask:
     if x1 > x0 and y1 > y0:
         out[y0:y1, x0:x1] = mask[y0 - dy : y1 - dy, x0 - dx : x1 - dx]
     return out
+
+
+def _explains(silhouette: Mask, lit: Mask, body: Mask) -> bool:
+    """Whether what is lit lies inside the predicted silhouette and is spread over it: the rest of it is shadow."""
+    inside = np.count_nonzero(silhouette & lit) >= 0.95 * np.count_nonzero(lit)
+    return inside and np.count_nonzero(silhouette & body) >= 0.5 * np.count_nonzero(silhouette)
+
+
+def _shadowed(silhouette: Mask, lit: Mask) -> Mask:
+    """The dark parts of a silhouette: what is not lit, without the slivers that a slightly wrong pose leaves."""
+    _, _, w, h = cv2.boundingRect(silhouette)
+    radius = max(2, round(0.02 * max(w, h)))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    return cv2.morphologyEx(silhouette & (1 - lit), cv2.MORPH_OPEN, kernel)
 
 
 def _centroid(mask: Mask) -> NDArray[np.float64]:

@@ -109,7 +109,6 @@ def _polar(image: NDArray[np.uint8], center: NDArray[np.float64], radius: float)
 
 def _cut_direction(mask: NDArray[np.bool_]) -> NDArray[np.float64] | None:
     """Unit vector from the mask's middle towards where the image border cuts it, or None."""
-    h, w = mask.shape
     weights = np.array([mask[:, 0].sum(), mask[:, -1].sum(), mask[0].sum(), mask[-1].sum()], dtype=np.float64)
     if not weights.any():
         return None

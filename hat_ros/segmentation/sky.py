@@ -21,6 +21,8 @@ _MIN_STEP = 1.5  # smallest excess over the sky that counts, for noise-free imag
 _EDGE_SHARE = 0.4
 _STAR_AREA_PX = 40  # a blob below this, away from the target, is a star
 _SPECK_AREA_PX = 6
+_HOLE_SHARE = 0.1  # a hole up to this share of the area is a dark detail; larger ones are gaps between parts
+_COARSE_PX = 9  # side of the mean that finds what is barely brighter than the sky
 _HOT_EXCESS = 30  # a hot pixel is this much brighter than all its neighbours
 
 _K3 = np.ones((3, 3), np.uint8)
@@ -69,7 +71,7 @@ def measure_sky(rgb: NDArray[np.uint8]) -> Sky:
 def lit_regions(sky: Sky) -> list[NDArray[np.uint8]]:
     """Bright objects, largest first, each (H, W) uint8 of 0 and 1: connected pieces and what lies close to them."""
     bright = (sky.mean3 > sky.threshold).astype(np.uint8)
-    count, label, stats, _ = cv2.connectedComponentsWithStats(bright, connectivity=8)
+    _, label, stats, _ = cv2.connectedComponentsWithStats(bright, connectivity=8)
     area = stats[:, cv2.CC_STAT_AREA].copy()
     area[0] = 0
     keep = area >= _SPECK_AREA_PX
@@ -88,7 +90,7 @@ def lit_regions(sky: Sky) -> list[NDArray[np.uint8]]:
 
 def trim_outline(sky: Sky, region: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Take off what blur and the 3 x 3 mean added around the outline."""
-    region = fill_holes(region, 0.02)
+    region = fill_holes(region, _HOLE_SHARE)
     inner = cv2.erode(region, _K5, borderType=cv2.BORDER_REPLICATE)
     peak = cv2.dilate(sky.luma, _K5).astype(np.float32)
     inside = sky.luma - sky.level >= _EDGE_SHARE * (peak - sky.level)
@@ -122,6 +124,38 @@ def join_parts(regions: list[NDArray[np.uint8]], main: int) -> NDArray[np.uint8]
         near_x = u >= x - margin and u + a <= x + w + margin
         if near_x and v >= y - margin and v + b <= y + h + margin:
             out |= region
+    return out
+
+
+def bridge_gaps(measured: Sky, lit: NDArray[np.uint8], side_px: int) -> list[NDArray[np.bool_]]:
+    """What a body of which only scattered parts are lit may look like: gaps of growing width bridged.
+
+    Args:
+        measured: the sky of this image.
+        lit: (H, W) uint8 of 0 and 1, the lit parts.
+        side_px: longer side of the reduced masks returned.
+
+    Returns:
+        Reduced (h, w) masks; the first has no gap bridged.
+    """
+    coarse = cv2.boxFilter(measured.luma, cv2.CV_32F, (_COARSE_PX, _COARSE_PX))
+    # A mean over n x n instead of 3 x 3 pixels has 3 / n of the noise.
+    faint = coarse > measured.level + (measured.threshold - measured.level) * 3 / _COARSE_PX
+    faint = cv2.erode(faint.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_RECT, (_COARSE_PX, _COARSE_PX)))
+    x, y, w, h = cv2.boundingRect(lit)
+    near = np.zeros_like(lit)
+    near[y : y + h, x : x + w] = faint[y : y + h, x : x + w]
+    scale = min(1.0, side_px / max(lit.shape))
+    size = (max(1, round(lit.shape[1] * scale)), max(1, round(lit.shape[0] * scale)))
+    small_lit = (cv2.resize(lit * 255, size, interpolation=cv2.INTER_AREA) > 127).astype(np.uint8)
+    small = (cv2.resize((lit | near) * 255, size, interpolation=cv2.INTER_AREA) > 63).astype(np.uint8)
+    out = [small_lit.astype(bool)]
+    for share in (0.02, 0.04, 0.08, 0.16):
+        radius = max(1, round(share * max(w, h) * scale))
+        padded = cv2.copyMakeBorder(small, radius, radius, radius, radius, cv2.BORDER_CONSTANT, value=0)
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+        closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, kernel)[radius:-radius, radius:-radius]
+        out.append(fill_holes(np.ascontiguousarray(closed), 1.0).astype(bool))
     return out
 
 
