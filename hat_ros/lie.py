@@ -10,6 +10,8 @@ numbers below); quaternion extraction after Shepperd, J. Guidance and Control 1 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,6 +34,8 @@ def hat(v: Array) -> Array:
 def so3_exp(rotvec: Array) -> Array:
     """Rotation matrix of a rotation vector (eq. 132): (..., 3) -> (..., 3, 3)."""
     rotvec = np.asarray(rotvec, dtype=np.float64)
+    if rotvec.ndim == 1:
+        return _so3_exp_single(rotvec)
     angle_sq = np.sum(rotvec * rotvec, axis=-1)
     small = angle_sq < _SMALL_ANGLE_SQ
     safe = np.where(small, 1.0, angle_sq)
@@ -48,6 +52,10 @@ def so3_log(R: Array) -> Array:
     Goes through the quaternion, which stays well conditioned up to and at 180 degrees.
     """
     q = quat_from_matrix(R)
+    if q.ndim == 1:
+        x, y, z, w = q.tolist()
+        norm = math.sqrt(x * x + y * y + z * z)
+        return q[:3] * (2.0 if norm < 1e-9 else 2.0 * math.atan2(norm, w) / norm)
     norm = np.linalg.norm(q[..., :3], axis=-1)
     angle = 2.0 * np.arctan2(norm, q[..., 3])
     small = norm < 1e-9
@@ -69,6 +77,8 @@ def angle_between(R_a: Array, R_b: Array) -> Array:
 def quat_from_matrix(R: Array) -> Array:
     """Unit quaternion xyzw with qw >= 0 of a rotation matrix: (..., 3, 3) -> (..., 4)."""
     R = np.asarray(R, dtype=np.float64)
+    if R.ndim == 2:
+        return _quat_from_matrix_single(R)
     m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     # Four times the square of each component; dividing by the largest keeps full precision everywhere.
     squares = np.stack([1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22, 1 + m00 + m11 + m22], axis=-1)
@@ -92,6 +102,8 @@ def quat_from_matrix(R: Array) -> Array:
 def matrix_from_quat(quat_xyzw: Array) -> Array:
     """Rotation matrix of a quaternion, normalised here: (..., 4) -> (..., 3, 3)."""
     q = np.asarray(quat_xyzw, dtype=np.float64)
+    if q.ndim == 1:
+        return _matrix_from_quat_single(q)
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     return np.stack(
@@ -139,3 +151,55 @@ def is_rigid(T: Array, tolerance: float = 1e-4) -> NDArray[np.bool_]:
     orthogonal = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(-1, -2)) < tolerance
     last = np.abs(safe[..., 3, :] - np.array([0.0, 0.0, 0.0, 1.0])).max(axis=-1) < tolerance
     return finite & orthogonal & last & (np.linalg.det(R) > 0)
+
+
+# One pose at a time is what a stage handles per frame; there the batched functions above would spend all their time on
+# numpy's overhead. Same formulas on plain floats, agreeing with the batched ones to the last bit or two.
+
+
+def _so3_exp_single(rotvec: Array) -> Array:
+    x, y, z = rotvec.tolist()
+    angle_sq = x * x + y * y + z * z
+    if angle_sq < _SMALL_ANGLE_SQ:
+        a, b = 1.0 - angle_sq / 6.0, 0.5 - angle_sq / 24.0
+    else:
+        angle = math.sqrt(angle_sq)
+        a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle_sq
+    return np.array(
+        [
+            [1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
+            [b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x],
+            [b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)],
+        ]
+    )
+
+
+def _quat_from_matrix_single(R: Array) -> Array:
+    (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = R.tolist()
+    squares = (1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22, 1 + m00 + m11 + m22)
+    best = max(range(4), key=squares.__getitem__)
+    x, y, z, w = (
+        (squares[0], m01 + m10, m02 + m20, m21 - m12),
+        (m01 + m10, squares[1], m12 + m21, m02 - m20),
+        (m02 + m20, m12 + m21, squares[2], m10 - m01),
+        (m21 - m12, m02 - m20, m10 - m01, squares[3]),
+    )[best]
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    if w < 0:
+        norm = -norm
+    return np.array([x / norm, y / norm, z / norm, w / norm])
+
+
+def _matrix_from_quat_single(quat_xyzw: Array) -> Array:
+    x, y, z, w = quat_xyzw.tolist()
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    if norm == 0.0:
+        return np.full((3, 3), np.nan)
+    x, y, z, w = x / norm, y / norm, z / norm, w / norm
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,50 +40,46 @@ class PoseProblem:
     huber_delta_m: float | None
 
     def residuals(self, R: Float, t: Float) -> Float:
-        """[g lambda Log(R_M R^T); g (t_M - t); w lambda Log(R_E); w t_E]: (n, 3, 3), (n, 3) -> (n, 12) metres."""
-        R_T = np.swapaxes(R, -1, -2)
-        R_E = self.predicted[:3, :3] @ R_T
-        rotvecs = lie.so3_log(np.stack([self.anchor[:3, :3] @ R_T, R_E]))
-        return np.concatenate(
-            [
-                self.anchor_weight * self.lever_m_per_rad * rotvecs[0],
-                self.anchor_weight * (self.anchor[:3, 3] - t),
-                self.relative_weight * self.lever_m_per_rad * rotvecs[1],
-                self.relative_weight * (self.predicted[:3, 3] - (R_E @ t[..., None])[..., 0]),
-            ],
-            axis=-1,
-        )
+        """[g lambda Log(R_M R^T); g (t_M - t); w lambda Log(R_E); w t_E] in metres: (3, 3), (3,) -> (12,)."""
+        g, w, lever = self.anchor_weight, self.relative_weight, self.lever_m_per_rad
+        R_E = self.predicted[:3, :3] @ R.T
+        out = np.empty(12)
+        out[0:3] = (g * lever) * lie.so3_log(self.anchor[:3, :3] @ R.T)
+        out[3:6] = g * (self.anchor[:3, 3] - t)
+        out[6:9] = (w * lever) * lie.so3_log(R_E)
+        out[9:12] = w * (self.predicted[:3, 3] - R_E @ t)
+        return out
 
-    def jacobians(self, R: Float, t: Float, residuals: Float) -> Float:
-        """Derivative of the residuals by (delta, tau), R <- Exp(delta) R, t <- t + tau: (n, 12, 6)."""
-        u, w = self.anchor_weight, self.relative_weight
-        R_E = self.predicted[:3, :3] @ np.swapaxes(R, -1, -2)
-        J = np.zeros((len(R), 12, 6))
-        for first, weight in ((0, u), (6, w)):
-            scale = weight * self.lever_m_per_rad
-            J[:, first : first + 3, :3] = -scale * _right_jacobian_inverse(residuals[:, first : first + 3] / scale)
-        J[:, 3:6, 3:] = -u * np.eye(3)
-        J[:, 9:12, :3] = -w * (R_E @ lie.hat(t))
-        J[:, 9:12, 3:] = -w * R_E
+    def jacobian(self, R: Float, t: Float, residuals: Float) -> Float:
+        """Derivative of the residuals by (delta, tau), R <- Exp(delta) R, t <- t + tau: (12, 6)."""
+        g, w, lever = self.anchor_weight, self.relative_weight, self.lever_m_per_rad
+        R_E = self.predicted[:3, :3] @ R.T
+        J = np.zeros((12, 6))
+        J[0:3, :3] = (-g * lever) * _right_jacobian_inverse(residuals[0:3] / (g * lever))
+        J[3:6, 3:] = -g * np.eye(3)
+        J[6:9, :3] = (-w * lever) * _right_jacobian_inverse(residuals[6:9] / (w * lever))
+        J[9:12, :3] = -w * (R_E @ lie.hat(t))
+        J[9:12, 3:] = -w * R_E
         return J
 
-    def cost(self, residuals: Float) -> Float:
-        """Sum of h_delta over the components: (n, 12) -> (n,)."""
+    def cost(self, residuals: Float) -> float:
+        """Sum of h_delta over the components."""
         if self.huber_delta_m is None:
-            return 0.5 * np.sum(residuals * residuals, axis=-1)
-        inside = np.minimum(np.abs(residuals), self.huber_delta_m)
-        return np.sum(inside * (np.abs(residuals) - 0.5 * inside), axis=-1)
+            return 0.5 * float(residuals @ residuals)
+        size = np.abs(residuals)
+        inside = np.minimum(size, self.huber_delta_m)
+        return float(inside @ (size - 0.5 * inside))
 
     def influence(self, residuals: Float) -> Float:
         """Derivative of h_delta, componentwise."""
         if self.huber_delta_m is None:
             return residuals
-        return np.clip(residuals, -self.huber_delta_m, self.huber_delta_m)
+        return np.minimum(np.maximum(residuals, -self.huber_delta_m), self.huber_delta_m)
 
-    def gradients(self, R: Float, t: Float) -> Float:
-        """Gradient of the cost by (delta, tau): (n, 6)."""
+    def gradient(self, R: Float, t: Float) -> Float:
+        """Gradient of the cost by (delta, tau): (6,)."""
         residuals = self.residuals(R, t)
-        return np.einsum("nij,ni->nj", self.jacobians(R, t, residuals), self.influence(residuals))
+        return self.influence(residuals) @ self.jacobian(R, t, residuals)
 
 
 def solve_pose(problem: PoseProblem) -> Float:
@@ -94,32 +91,33 @@ def solve_pose(problem: PoseProblem) -> Float:
     R, t = problem.predicted[:3, :3], problem.predicted[:3, 3]
     newton, last_gradient = False, np.inf
     for _ in range(_MAX_STEPS):
-        residuals = problem.residuals(R[None], t[None])
-        J = problem.jacobians(R[None], t[None], residuals)[0]
-        influence = problem.influence(residuals)[0]
-        gradient = J.T @ influence
+        residuals = problem.residuals(R, t)
+        J = problem.jacobian(R, t, residuals)
+        influence = problem.influence(residuals)
+        gradient = influence @ J
         size = float(np.abs(gradient).max())
         if size == 0.0:
             break
         newton = newton or size > _SLOW * last_gradient
         last_gradient = size
-        hessian = _hessian(problem, R, t) if newton else _reweighted_hessian(J, residuals[0], influence)
+        hessian = _hessian(problem, R, t) if newton else _reweighted_hessian(J, residuals, influence)
         step = _descent_step(hessian, gradient)
-        R, t, length = _walk_downhill(problem, R, t, step, float(problem.cost(residuals)[0]))
+        R, t, length = _walk_downhill(problem, R, t, step, problem.cost(residuals))
         if length < _STEP_TOLERANCE:
             break
     return lie.transform(R, t)
 
 
 def _right_jacobian_inverse(rotvec: Float) -> Float:
-    """J_r^-1 of SO(3) (Sola et al., eq. 144): (n, 3) -> (n, 3, 3)."""
-    angle_sq = np.sum(rotvec * rotvec, axis=-1)
-    small = angle_sq < 1e-6
-    safe = np.where(small, 1.0, angle_sq)
-    half = 0.5 * np.sqrt(safe)
-    factor = np.where(small, 1.0 / 12.0 + angle_sq / 720.0, (1.0 - half / np.tan(half)) / safe)
+    """J_r^-1 of SO(3) (Sola et al., eq. 144): (3,) -> (3, 3)."""
+    angle_sq = float(rotvec @ rotvec)
+    if angle_sq < 1e-6:
+        factor = 1.0 / 12.0 + angle_sq / 720.0
+    else:
+        half = 0.5 * math.sqrt(angle_sq)
+        factor = (1.0 - half / math.tan(half)) / angle_sq
     k = lie.hat(rotvec)
-    return np.eye(3) + 0.5 * k + factor[..., None, None] * (k @ k)
+    return np.eye(3) + 0.5 * k + factor * (k @ k)
 
 
 def _reweighted_hessian(J: Float, residuals: Float, influence: Float) -> Float:
@@ -129,12 +127,13 @@ def _reweighted_hessian(J: Float, residuals: Float, influence: Float) -> Float:
 
 def _hessian(problem: PoseProblem, R: Float, t: Float) -> Float:
     """Symmetrised central differences of the gradient: (6, 6)."""
-    turns = lie.so3_exp(_DIFFERENCE * np.vstack([np.eye(3), -np.eye(3)])) @ R
-    shifts = t + _DIFFERENCE * np.vstack([np.eye(3), -np.eye(3)])
-    still_R, still_t = np.broadcast_to(R, (6, 3, 3)), np.broadcast_to(t, (6, 3))
-    gradients = problem.gradients(np.concatenate([turns, still_R]), np.concatenate([still_t, shifts]))
-    forward, backward = gradients[[0, 1, 2, 6, 7, 8]], gradients[[3, 4, 5, 9, 10, 11]]
-    H = (forward - backward) / (2.0 * _DIFFERENCE)
+    H = np.empty((6, 6))
+    for axis in range(3):
+        nudge = np.zeros(3)
+        nudge[axis] = _DIFFERENCE
+        H[axis] = problem.gradient(lie.so3_exp(nudge) @ R, t) - problem.gradient(lie.so3_exp(-nudge) @ R, t)
+        H[axis + 3] = problem.gradient(R, t + nudge) - problem.gradient(R, t - nudge)
+    H /= 2.0 * _DIFFERENCE
     return 0.5 * (H + H.T)
 
 
@@ -151,7 +150,7 @@ def _walk_downhill(problem: PoseProblem, R: Float, t: Float, step: Float, cost: 
     """Take the step, halved until the cost does not grow; stay when rounding hides any descent."""
     for _ in range(_MAX_HALVINGS):
         R_new, t_new = lie.so3_exp(step[:3]) @ R, t + step[3:]
-        if problem.cost(problem.residuals(R_new[None], t_new[None]))[0] <= cost * (1.0 + 1e-15):
+        if problem.cost(problem.residuals(R_new, t_new)) <= cost * (1.0 + 1e-15):
             return R_new, t_new, float(np.abs(step).max())
         step = 0.5 * step
     return R, t, 0.0

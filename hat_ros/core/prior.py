@@ -1,4 +1,4 @@
-"""Fused poses of the past as a hint for the front ends (DESIGN 5.4), independent of timing.
+"""Fused poses of the past as a hint for the front ends, independent of timing.
 
 Only estimates of frames ``t - delay_frames`` and earlier are ever used, found by exact stamp, however many newer ones
 have already arrived: so the answer is the same in one process and in five.
