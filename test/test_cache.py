@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+
+from hat_ros.cache import cache_folder, cached_arrays
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+
+
+def build():
+    return {"a": np.arange(6).reshape(2, 3), "empty": np.zeros((0, 4))}
+
+
+def forbidden():
+    pytest.fail("built again")
+
+
+def test_second_call_reads_what_the_first_built():
+    first = cached_arrays("thing", "key", build)
+    second = cached_arrays("thing", "key", forbidden)
+    for name, array in build().items():
+        np.testing.assert_array_equal(first[name], array)
+        np.testing.assert_array_equal(second[name], array)
+        assert not second[name].flags.writeable
+
+
+def test_another_key_is_another_entry():
+    cached_arrays("thing", "key", build)
+    other = cached_arrays("thing", "other", lambda: {"a": np.zeros(2)})
+    np.testing.assert_array_equal(other["a"], np.zeros(2))
+
+
+@pytest.mark.parametrize("damage", ["flip", "truncate", "manifest", "missing"])
+def test_a_damaged_entry_is_built_again(damage):
+    cached_arrays("thing", "key", build)
+    entry = next(cache_folder().glob("thing-*"))
+    array, manifest = entry / "a.npy", entry / "manifest.json"
+    content = bytearray(array.read_bytes())
+    if damage == "flip":
+        content[-1] ^= 1
+        array.write_bytes(content)
+    elif damage == "truncate":
+        array.write_bytes(content[:-5])
+    elif damage == "manifest":
+        manifest.write_text("not json")
+    else:
+        array.unlink()
+    calls = []
+    arrays = cached_arrays("thing", "key", lambda: calls.append(1) or build())
+    assert calls == [1]
+    np.testing.assert_array_equal(arrays["a"], build()["a"])
+    np.testing.assert_array_equal(cached_arrays("thing", "key", forbidden)["a"], build()["a"])
+
+
+def test_a_cache_that_cannot_be_written_is_no_error(tmp_path, monkeypatch):
+    blocked = tmp_path / "file"
+    blocked.write_text("in the way")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(blocked))
+    np.testing.assert_array_equal(cached_arrays("thing", "key", build)["a"], build()["a"])
+
+
+def test_no_unfinished_entries_stay_behind():
+    cached_arrays("thing", "key", build)
+    assert [path.name.split("-")[0] for path in cache_folder().iterdir()] == ["thing"]
