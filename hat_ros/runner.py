@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hat_ros.config import HatConfig
-from hat_ros.errors import RunError
+from hat_ros.errors import BagError, HatError, RunError, UsageError
+from hat_ros.evaluation.figures import error_figure, image_bytes, range_figure
 from hat_ros.evaluation.metrics import mask_summary
 from hat_ros.evaluation.overlay import OverlayPainter, VideoFile
 from hat_ros.evaluation.report import write_report
@@ -153,10 +154,78 @@ def complete_folder(folder: Path, source: Source | None, measured: dict[str, Any
     write_json(folder / METRICS_FILE, figures)
     strip = paint_overlay(folder, source, log, video) if source and (video or report) else []
     if report:
+        _report(folder, log, figures, strip)
+
+
+def evaluate_folder(folder: Path, truth: Path | None = None) -> None:
+    """Score a finished run again, perhaps against another truth, and rewrite tables, metrics and report.
+
+    Args:
+        folder: result folder; what the run itself measured is kept from its ``metrics.json``.
+        truth: recording whose truth counts; by default the one that is in the result bag.
+
+    Raises:
+        UsageError: it is no result folder.
+        BagError: a bag is damaged, or the recording has no truth for these frames.
+    """
+    run, figures, _ = read_folder(folder)
+    log = read_result_bag(folder / BAG_FOLDER)
+    source = open_source(truth) if truth is not None else _source_of(run)
+    if truth is not None:
+        first, last = int(log.stamp_ns[0]), int(log.stamp_ns[-1])
+        log = log.with_truth({stamp: row for stamp, row in source.truth_rows().items() if first <= stamp <= last})
+        if not log.has_truth.any():
+            raise BagError(f"{truth} has no true pose at any stamp of {folder}: is it the recording of this run?")
+    figures |= score_run(log, source.target if source else None)
+    write_tables(folder, log)
+    write_json(folder / METRICS_FILE, figures)
+    _report(folder, log, figures, paint_overlay(folder, source, log, video=False) if source else [])
+
+
+def plot_folder(folder: Path, out: Path, form: str) -> list[Path]:
+    """Draw a finished run into image files of the given format; returns their paths."""
+    _, figures, _ = read_folder(folder)
+    log = read_result_bag(folder / BAG_FOLDER)
+    drawn = {"errors": error_figure(log)}
+    if figures.get("range_bins"):
+        drawn["range"] = range_figure(figures["range_bins"])
+    paths = [out / f"{name}.{form}" for name in drawn]
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for path, figure in zip(paths, drawn.values(), strict=True):
+            path.write_bytes(image_bytes(figure, form))
+    except OSError as error:
+        raise RunError(f"cannot write {out}: {error.strerror}") from None
+    return paths
+
+
+def read_folder(folder: Path) -> tuple[dict[str, Any], dict[str, Any], str]:
+    """``run.json``, ``metrics.json`` and ``config.yaml`` of a result folder.
+
+    Raises:
+        UsageError: one of them is missing or unreadable.
+    """
+    try:
         run = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
-        config_text = (folder / CONFIG_FILE).read_text(encoding="utf-8")
-        title = f"{Path(run['source']).name}: {run.get('mode', 'hat')}"
-        write_report(folder / "report.html", title, log, figures, run, config_text, strip)
+        figures = json.loads((folder / METRICS_FILE).read_text(encoding="utf-8"))
+        return run, figures, (folder / CONFIG_FILE).read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "not valid JSON"
+        raise UsageError(f"{folder} is no finished result folder ({reason}): give the --out of a run") from None
+
+
+def _source_of(run: dict[str, Any]) -> Source | None:
+    """The recording that a run was made from, None when it is no longer there."""
+    try:
+        return open_source(run["source"])
+    except HatError:
+        return None
+
+
+def _report(folder: Path, log: RunLog, figures: dict[str, Any], strip: list[tuple[str, NDArray[np.uint8]]]) -> None:
+    run, _, config_text = read_folder(folder)
+    title = f"{Path(run['source']).name}: {run.get('mode', 'hat')}"
+    write_report(folder / "report.html", title, log, figures, run, config_text, strip)
 
 
 def paint_overlay(folder: Path, source: Source, log: RunLog, video: bool) -> list[tuple[str, NDArray[np.uint8]]]:

@@ -12,7 +12,52 @@ from hat_ros.cli.run import MODES
 
 def add_commands(commands: Commands) -> None:
     """Register this group."""
+    _add_evaluate(commands)
+    _add_plot(commands)
     _add_bench(commands)
+
+
+def _add_evaluate(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "evaluate",
+        help="score a finished run again",
+        description="Compute the metrics of a result folder again from its bag, rewrite poses.csv, metrics.json and "
+        "report.html, and print the main figures.",
+    )
+    parser.add_argument("folder", type=Path, metavar="DIR", help="result folder of `hat replay` or `hat track`")
+    parser.add_argument(
+        "--truth", type=Path, metavar="BAG", help="recording with the truth (default: the result bag's)"
+    )
+    parser.set_defaults(command=_evaluate)
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    from hat_ros.cli.console import print_figures
+    from hat_ros.runner import evaluate_folder
+
+    evaluate_folder(arguments.folder, arguments.truth)
+    print_figures(arguments.folder)
+    return 0
+
+
+def _add_plot(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "plot",
+        help="plots of a finished run as image files",
+        description="Draw the errors over time, and by range, of a result folder.",
+    )
+    parser.add_argument("folder", type=Path, metavar="DIR", help="result folder")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where the images go (default: DIR/plots)")
+    parser.add_argument("--format", choices=("png", "svg", "pdf"), default="png", help="image format (default: png)")
+    parser.set_defaults(command=_plot)
+
+
+def _plot(arguments: argparse.Namespace) -> int:
+    from hat_ros.runner import plot_folder
+
+    for path in plot_folder(arguments.folder, arguments.out or arguments.folder / "plots", arguments.format):
+        print(path)
+    return 0
 
 
 def _add_campaign(parser: argparse.ArgumentParser) -> None:

@@ -116,10 +116,12 @@ def range_figure(bins: list[dict[str, float]]) -> Figure:
     return figure
 
 
-def png(figure: Figure, dpi: int = 110) -> bytes:
-    """The figure as a PNG without time stamps, so that the same data give the same bytes; the figure is closed."""
+def image_bytes(figure: Figure, form: str = "png", dpi: int = 110) -> bytes:
+    """The figure as png, svg or pdf, without dates, so that the same data give the same bytes; the figure is closed."""
     out = io.BytesIO()
-    figure.savefig(out, format="png", dpi=dpi, metadata={"Software": None})
+    undated = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[form]
+    with matplotlib.rc_context({"svg.hashsalt": "hat_ros"}):
+        figure.savefig(out, format=form, dpi=dpi, metadata=undated)
     plt.close(figure)
     return out.getvalue()
 

@@ -78,7 +78,7 @@ def write_report(
         f"<h1>{html.escape(title)}</h1>",
         _figure_table(metrics),
         "<h2>Over time</h2>",
-        _image(figures.png(figures.error_figure(log)), "errors over time"),
+        _image(figures.image_bytes(figures.error_figure(log)), "errors over time"),
         '<p class="note">Background: state of the output. Crosses: best of the K candidates at keyframes; dots: the '
         "anchor that was chosen; dashed red: alignment dropped. Frames without a pose have no error and lower the "
         "coverage.</p>",
@@ -86,7 +86,10 @@ def write_report(
     if strip:
         parts += ["<h2>Overlay</h2>", _strip(strip)]
     if metrics.get("range_bins"):
-        parts += ["<h2>By range</h2>", _image(figures.png(figures.range_figure(metrics["range_bins"])), "by range")]
+        parts += [
+            "<h2>By range</h2>",
+            _image(figures.image_bytes(figures.range_figure(metrics["range_bins"])), "by range"),
+        ]
     parts += [
         "<h2>Where it comes from</h2>",
         f"<pre>{html.escape(json.dumps(run, indent=2))}</pre>",
