@@ -64,7 +64,7 @@ _SWISSCUBE = ClipSpec(
 )  # fmt: skip
 _YCBV = ClipSpec(
     frames=300, width=640, height=480, focal_px=1067.0, range_m=(1.6, 1.3), drift=0.25, table=True,
-    start_rotvec=(-2.2, 0.0, 0.0), spin_axis=(0.0, 0.0, 1.0), spin_deg_per_frame=0.12,
+    start_rotvec=(2.2, 0.0, 0.0), spin_axis=(0.0, 0.0, 1.0), spin_deg_per_frame=0.12,
     to_sun_cam=(-0.5, -1.0, -0.6), exposure=0.6, ambient=0.35, noise=0.003, kind="ycbv",
 )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Rasterising with OpenGL through pyrender on EGL (no display needed): filtered textures, and speed where there is a GPU.
+"""Rasterising with OpenGL through pyrender on EGL, no display needed: filtered textures, and speed on a GPU.
 
 Depth and albedo come from OpenGL. Face indices and normals come from the ray caster at the same pixel centres, because
 pyrender blends the samples of its frame buffer, which indices do not survive; at silhouette pixels where the two
