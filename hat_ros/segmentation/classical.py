@@ -34,7 +34,6 @@ _MIN_CONTRAST = 8.0  # 8-bit colour step across the outline below which there is
 _AGREEMENT = 0.8  # overlap of two independent masks that mean the same
 _CLEARLY_BETTER = 0.025  # shape overlap by which one explanation must beat the simpler one
 _SECOND_REGION_SHARE = 0.2  # a second bright region this large makes the choice between them a question
-_WHOLE_SHARE = 0.6  # of the body's area is lit: what is dark then is left out
 _SCATTERED_GAIN = 0.1  # shape overlap that bridging the gaps between lit parts must bring
 _MAX_RETRY_FRAMES = 8
 _CHECK_UNAIDED_FRAMES = 3  # frames between checks of a mask that no prior holds in place
@@ -86,9 +85,9 @@ class ClassicalSegmenter:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the previous mask."""
-        self._mask: Mask | None = None
-        self._velocity_xy = np.zeros(2)
+        """Forget the previous masks."""
+        self._mask: Mask | None = None  # of the previous frame
+        self._before: Mask | None = None  # of the frame before that
         self._since_check = 0
         self._failures = 0
         self._wait = 0
@@ -101,17 +100,10 @@ class ClassicalSegmenter:
             mask = self._before_sky(measured, frame, prior)
         else:
             mask = self._before_texture(frame, prior)
-        self._remember(mask)
+        if mask is not None and not mask.any():
+            mask = None
+        self._before, self._mask = self._mask, mask
         return None if mask is None else Detection(mask.astype(bool))
-
-    def _remember(self, mask: Mask | None) -> None:
-        if mask is None or not mask.any():
-            self._mask = None
-            self._velocity_xy = np.zeros(2)
-            return
-        if self._mask is not None and not sky.touches_border(mask) and not sky.touches_border(self._mask):
-            self._velocity_xy = _centroid(mask) - _centroid(self._mask)
-        self._mask = mask
 
     # Black sky -------------------------------------------------------------------------------------------------
 
@@ -134,9 +126,9 @@ class ClassicalSegmenter:
 
     def _complete(self, measured: sky.Sky, lit: Mask) -> Mask:
         """The body of which ``lit`` are the lit parts: ``lit`` itself unless it is scattered over a CAD silhouette."""
-        options = sky.bridge_gaps(measured, lit, self._config.work_side_px)
-        if np.count_nonzero(options[0]) >= _WHOLE_SHARE * np.count_nonzero(options[-2]):
+        if not sky.is_scattered(lit):
             return lit
+        options = sky.bridge_gaps(measured, lit, self._config.work_side_px)
         shapes = [self._bank.overlap(option) for option in options]
         best = int(np.argmax(shapes))
         if shapes[best] < shapes[0] + _SCATTERED_GAIN:
@@ -190,7 +182,7 @@ class ClassicalSegmenter:
             The mask, None when it was lost, and whether the prediction helped.
         """
         assert self._mask is not None
-        dx, dy = (int(v) for v in np.rint(self._velocity_xy))
+        dx, dy = self._shift()
         x, y, w, h = cv2.boundingRect(self._mask)
         box = (x + dx, y + dy, x + w + dx, y + h + dy)
         silhouette = self._silhouette(frame, prior)
@@ -219,6 +211,15 @@ class ClassicalSegmenter:
         if region.edge_contrast(window.rgb, cut) < _MIN_CONTRAST:
             return None, aided
         return self._finish(frame, window, cut), aided
+
+    def _shift(self) -> tuple[int, int]:
+        """Whole pixels (x, y) that the target moved in the last frame; none while the image border cuts it."""
+        if self._mask is None or self._before is None:
+            return 0, 0
+        if sky.touches_border(self._mask) or sky.touches_border(self._before):
+            return 0, 0
+        dx, dy = np.rint(_centroid(self._mask) - _centroid(self._before))
+        return int(dx), int(dy)
 
     def _cross_check(self, frame: Frame, tracked: Mask, aided: bool) -> Mask | None:
         """Compare a tracked mask with what a search from nothing finds; keep the one that the CAD explains better.

@@ -22,10 +22,12 @@ _EDGE_SHARE = 0.4
 _STAR_AREA_PX = 40  # a blob below this, away from the target, is a star
 _SPECK_AREA_PX = 6
 _HOLE_SHARE = 0.1  # a hole up to this share of the area is a dark detail; larger ones are gaps between parts
+_WHOLE_SHARE = 0.6  # of a body's area is lit, or else it counts as scattered
 _COARSE_PX = 9  # side of the mean that finds what is barely brighter than the sky
+_FAINT_STEPS = 4  # below this many thresholds of contrast a single pixel says nothing
+_MAX_REGIONS = 8  # looked at; a field of stars may hold thousands
 _HOT_EXCESS = 30  # a hot pixel is this much brighter than all its neighbours
 
-_K3 = np.ones((3, 3), np.uint8)
 _K5 = np.ones((5, 5), np.uint8)
 _NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
 
@@ -53,12 +55,15 @@ def measure_sky(rgb: NDArray[np.uint8]) -> Sky:
     """Level and noise of the sky from the image border: (H, W, 3) uint8."""
     luma = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     around = cv2.dilate(luma, _NEIGHBOURS)
-    luma = np.where(luma > cv2.add(around, _HOT_EXCESS), around, luma)
+    hot = cv2.findNonZero(cv2.threshold(cv2.subtract(luma, around), _HOT_EXCESS, 1, cv2.THRESH_BINARY)[1])
+    if hot is not None:
+        cols, rows = hot[:, 0].T
+        luma[rows, cols] = around[rows, cols]
     mean3 = cv2.boxFilter(luma, cv2.CV_32F, (3, 3))
     r = min(_RING_PX, min(luma.shape) // 4)
-    ring = np.concatenate(
-        [mean3[1:r].ravel(), mean3[-r:-1].ravel(), mean3[r:-r, 1:r].ravel(), mean3[r:-r, -r:-1].ravel()]
-    )
+    # Every other row and column of the border: neighbours share pixels of their means anyway.
+    strips = mean3[1:r:2, ::2], mean3[-r:-1:2, ::2], mean3[r:-r:2, 1:r:2], mean3[r:-r:2, -r:-1:2]
+    ring = np.concatenate([strip.ravel() for strip in strips])
     dark = ring[ring < _SKY_MAX]
     if not dark.size:
         return Sky(luma, mean3, 0.0, 0.0, 0.0)
@@ -71,32 +76,49 @@ def measure_sky(rgb: NDArray[np.uint8]) -> Sky:
 def lit_regions(sky: Sky) -> list[NDArray[np.uint8]]:
     """Bright objects, largest first, each (H, W) uint8 of 0 and 1: connected pieces and what lies close to them."""
     bright = (sky.mean3 > sky.threshold).astype(np.uint8)
-    _, label, stats, _ = cv2.connectedComponentsWithStats(bright, connectivity=8)
-    area = stats[:, cv2.CC_STAT_AREA].copy()
-    area[0] = 0
-    keep = area >= _SPECK_AREA_PX
-    if not keep.any():
-        return []
-    bright = keep.astype(np.uint8)[label]
-    # Pieces of one body are close together: join what a small gap separates.
     gap = max(2, round(0.006 * max(bright.shape)))
+    x, y, w, h = cv2.boundingRect(bright)
+    if not w:
+        return []
+    # All further work is done in the part of the image that holds anything.
+    x0, y0 = max(0, x - gap - 2), max(0, y - gap - 2)
+    x1, y1 = min(bright.shape[1], x + w + gap + 2), min(bright.shape[0], y + h + gap + 2)
+    part = np.ascontiguousarray(bright[y0:y1, x0:x1])
+    luma = np.ascontiguousarray(sky.luma[y0:y1, x0:x1])
+    out = []
+    for piece in _groups(part, gap):
+        region = np.zeros_like(bright)
+        region[y0:y1, x0:x1] = _trim_outline(piece, luma, sky)
+        out.append(region)
+    return out
+
+
+def _groups(bright: NDArray[np.uint8], gap: int) -> list[NDArray[np.uint8]]:
+    """Pieces of one body are close together: 0/1 masks of what is joined when small gaps are, largest first."""
+    _, label, stats, _ = cv2.connectedComponentsWithStats(bright, connectivity=8)
+    keep = (stats[:, cv2.CC_STAT_AREA] >= _SPECK_AREA_PX).astype(np.uint8)
+    keep[0] = 0
+    bright = keep[label]
     joined = cv2.dilate(bright, cv2.getStructuringElement(cv2.MORPH_RECT, (2 * gap + 1, 2 * gap + 1)))
     n_groups, group = cv2.connectedComponents(joined, connectivity=8)
-    group_area = np.bincount(group.ravel(), weights=bright.ravel(), minlength=n_groups)
-    group_area[0] = 0
-    order = [g for g in np.argsort(-group_area, kind="stable") if group_area[g] >= _STAR_AREA_PX]
-    return [trim_outline(sky, ((group == g) & (bright > 0)).astype(np.uint8)) for g in order[:8]]
+    group *= bright
+    area = np.bincount(group.ravel(), minlength=n_groups)
+    area[0] = 0
+    order = [g for g in np.argsort(-area, kind="stable") if area[g] >= _STAR_AREA_PX]
+    return [(group == g).astype(np.uint8) for g in order[:_MAX_REGIONS]]
 
 
-def trim_outline(sky: Sky, region: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _trim_outline(region: NDArray[np.uint8], luma: NDArray[np.uint8], sky: Sky) -> NDArray[np.uint8]:
     """Take off what blur and the 3 x 3 mean added around the outline."""
     region = fill_holes(region, _HOLE_SHARE)
     inner = cv2.erode(region, _K5, borderType=cv2.BORDER_REPLICATE)
-    peak = cv2.dilate(sky.luma, _K5).astype(np.float32)
-    inside = sky.luma - sky.level >= _EDGE_SHARE * (peak - sky.level)
+    rows, cols = np.nonzero(region != inner)
+    excess = luma[rows, cols] - sky.level
+    peak = cv2.dilate(luma, _K5)[rows, cols] - sky.level
     # Where the step is within the noise of a single pixel the mean decides, which already chose the region.
-    faint = peak - sky.level < 4 * (sky.threshold - sky.level)
-    return region & (inner | inside | faint)
+    faint = peak < _FAINT_STEPS * (sky.threshold - sky.level)
+    inner[rows, cols] = (excess >= _EDGE_SHARE * peak) | faint
+    return inner
 
 
 def fill_holes(mask: NDArray[np.uint8], max_share: float) -> NDArray[np.uint8]:
@@ -127,6 +149,16 @@ def join_parts(regions: list[NDArray[np.uint8]], main: int) -> NDArray[np.uint8]
     return out
 
 
+def is_scattered(lit: NDArray[np.uint8]) -> bool:
+    """Whether an (H, W) 0/1 mask is a loose collection of pieces rather than one body."""
+    x, y, w, h = cv2.boundingRect(lit)
+    scale = min(1.0, 64 / max(w, h))
+    size = (max(1, round(w * scale)), max(1, round(h * scale)))
+    share = cv2.resize(lit[y : y + h, x : x + w] * 255, size, interpolation=cv2.INTER_AREA)
+    joined = cv2.morphologyEx(share, cv2.MORPH_CLOSE, np.ones((11, 11), np.uint8))
+    return float(share.mean()) < _WHOLE_SHARE * float(joined.mean())
+
+
 def bridge_gaps(measured: Sky, lit: NDArray[np.uint8], side_px: int) -> list[NDArray[np.bool_]]:
     """What a body of which only scattered parts are lit may look like: gaps of growing width bridged.
 
@@ -138,18 +170,18 @@ def bridge_gaps(measured: Sky, lit: NDArray[np.uint8], side_px: int) -> list[NDA
     Returns:
         Reduced (h, w) masks; the first has no gap bridged.
     """
-    coarse = cv2.boxFilter(measured.luma, cv2.CV_32F, (_COARSE_PX, _COARSE_PX))
+    x, y, w, h = cv2.boundingRect(lit)
+    box = np.s_[y : y + h, x : x + w]
+    coarse = cv2.boxFilter(measured.luma[box], cv2.CV_32F, (_COARSE_PX, _COARSE_PX))
     # A mean over n x n instead of 3 x 3 pixels has 3 / n of the noise.
     faint = coarse > measured.level + (measured.threshold - measured.level) * 3 / _COARSE_PX
-    faint = cv2.erode(faint.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_RECT, (_COARSE_PX, _COARSE_PX)))
-    x, y, w, h = cv2.boundingRect(lit)
-    near = np.zeros_like(lit)
-    near[y : y + h, x : x + w] = faint[y : y + h, x : x + w]
+    faint = cv2.erode(faint.astype(np.uint8), np.ones((_COARSE_PX, _COARSE_PX), np.uint8))
+    either = lit.copy()
+    either[box] |= faint
     scale = min(1.0, side_px / max(lit.shape))
     size = (max(1, round(lit.shape[1] * scale)), max(1, round(lit.shape[0] * scale)))
-    small_lit = (cv2.resize(lit * 255, size, interpolation=cv2.INTER_AREA) > 127).astype(np.uint8)
-    small = (cv2.resize((lit | near) * 255, size, interpolation=cv2.INTER_AREA) > 63).astype(np.uint8)
-    out = [small_lit.astype(bool)]
+    small = (cv2.resize(either * 255, size, interpolation=cv2.INTER_AREA) > 63).astype(np.uint8)
+    out = [cv2.resize(lit * 255, size, interpolation=cv2.INTER_AREA) > 127]
     for share in (0.02, 0.04, 0.08, 0.16):
         radius = max(1, round(share * max(w, h) * scale))
         padded = cv2.copyMakeBorder(small, radius, radius, radius, radius, cv2.BORDER_CONSTANT, value=0)
