@@ -19,6 +19,9 @@ Array = NDArray[np.float64]
 
 # Below this squared angle sin(x)/x and its relatives are taken from their series: the next term is under 1e-17.
 _SMALL_ANGLE_SQ = 1e-8
+# 1 - (x/2) cot(x/2) loses digits earlier; the next term of its series is under 1e-14 here.
+_SMALL_ANGLE_SQ_JACOBIAN = 1e-5
+_EYE = np.eye(3)
 
 
 def hat(v: Array) -> Array:
@@ -61,6 +64,24 @@ def so3_log(R: Array) -> Array:
     small = norm < 1e-9
     factor = np.where(small, 2.0, angle / np.where(small, 1.0, norm))
     return factor[..., None] * q[..., :3]
+
+
+def so3_right_jacobian_inverse(rotvec: Array) -> Array:
+    """J_r^-1 (eq. 144): Log(Exp(v) Exp(d)) = v + J_r^-1(v) d + O(d^2). (..., 3) -> (..., 3, 3)."""
+    rotvec = np.asarray(rotvec, dtype=np.float64)
+    k = hat(rotvec)
+    if rotvec.ndim == 1:
+        angle_sq = float(rotvec @ rotvec)
+        half = 0.5 * math.sqrt(angle_sq)
+        small = angle_sq < _SMALL_ANGLE_SQ_JACOBIAN
+        factor = 1.0 / 12.0 + angle_sq / 720.0 if small else (1.0 - half / math.tan(half)) / angle_sq
+        return _EYE + 0.5 * k + factor * (k @ k)
+    angle_sq = np.sum(rotvec * rotvec, axis=-1)
+    small = angle_sq < _SMALL_ANGLE_SQ_JACOBIAN
+    safe = np.where(small, 1.0, angle_sq)
+    half = 0.5 * np.sqrt(safe)
+    factor = np.where(small, 1.0 / 12.0 + angle_sq / 720.0, (1.0 - half / np.tan(half)) / safe)
+    return _EYE + 0.5 * k + factor[..., None, None] * (k @ k)
 
 
 def rotation_angle(R: Array) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,9 +54,9 @@ class PoseProblem:
         g, w, lever = self.anchor_weight, self.relative_weight, self.lever_m_per_rad
         R_E = self.predicted[:3, :3] @ R.T
         J = np.zeros((12, 6))
-        J[0:3, :3] = (-g * lever) * _right_jacobian_inverse(residuals[0:3] / (g * lever))
+        J[0:3, :3] = (-g * lever) * lie.so3_right_jacobian_inverse(residuals[0:3] / (g * lever))
         J[3:6, 3:] = -g * np.eye(3)
-        J[6:9, :3] = (-w * lever) * _right_jacobian_inverse(residuals[6:9] / (w * lever))
+        J[6:9, :3] = (-w * lever) * lie.so3_right_jacobian_inverse(residuals[6:9] / (w * lever))
         J[9:12, :3] = -w * (R_E @ lie.hat(t))
         J[9:12, 3:] = -w * R_E
         return J
@@ -106,18 +105,6 @@ def solve_pose(problem: PoseProblem) -> Float:
         if length < _STEP_TOLERANCE:
             break
     return lie.transform(R, t)
-
-
-def _right_jacobian_inverse(rotvec: Float) -> Float:
-    """J_r^-1 of SO(3) (Sola et al., eq. 144): (3,) -> (3, 3)."""
-    angle_sq = float(rotvec @ rotvec)
-    if angle_sq < 1e-6:
-        factor = 1.0 / 12.0 + angle_sq / 720.0
-    else:
-        half = 0.5 * math.sqrt(angle_sq)
-        factor = (1.0 - half / math.tan(half)) / angle_sq
-    k = lie.hat(rotvec)
-    return np.eye(3) + 0.5 * k + factor * (k @ k)
 
 
 def _reweighted_hessian(J: Float, residuals: Float, influence: Float) -> Float:

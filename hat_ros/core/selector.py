@@ -69,13 +69,26 @@ class SelectorStage:
         if self._previous is None:
             return np.zeros(len(alive))
         previous, previous_alive, previous_path, previous_motion = self._previous
-        increment = rotation_increment(previous_motion, motion)
-        if increment is None:
-            return np.full(len(alive), previous_path.max())
-        predicted = increment @ previous.T_cam_target[previous_alive, :3, :3]
-        angle = lie.angle_between(candidates.T_cam_target[alive, None, :3, :3], predicted[None])
-        penalty = self._config.motion_weight_per_deg * np.degrees(angle)
+        penalty = motion_penalty(previous, previous_alive, previous_motion, candidates, alive, motion, self._config)
         return np.max(previous_path[None, :] - penalty, axis=1)
+
+
+def motion_penalty(
+    previous: Candidates,
+    previous_alive: NDArray[np.intp],
+    previous_motion: Motion,
+    current: Candidates,
+    current_alive: NDArray[np.intp],
+    current_motion: Motion,
+    config: SelectorConfig,
+) -> Float:
+    """mu d(R_{j,k}, Delta R_{j-1,h}) between the survivors of two keyframes: (k, h), zero without an increment."""
+    increment = rotation_increment(previous_motion, current_motion)
+    if increment is None:
+        return np.zeros((len(current_alive), len(previous_alive)))
+    predicted = increment @ previous.T_cam_target[previous_alive, :3, :3]
+    angle = lie.angle_between(current.T_cam_target[current_alive, None, :3, :3], predicted[None])
+    return config.motion_weight_per_deg * np.degrees(angle)
 
 
 def scaled_score(candidates: Candidates, config: SelectorConfig) -> Float:
