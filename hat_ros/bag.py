@@ -187,7 +187,7 @@ class BagReader:
                 found = wire.camera_from(message)
             except HatError as error:
                 raise FrameError(f"{self.path}, {self.camera_info_topic}: {error}") from None
-            if camera is not None and not _same_camera(camera, found):
+            if camera is not None and not wire.same_camera(camera, found):
                 raise BagError(f"{self.path}: the calibration changes at stamp {wire.stamp_of(message)}: split the bag")
             camera = found
         if camera is None:
@@ -265,10 +265,6 @@ class _ByStamp:
         while len(self._waiting) > self._BEHIND:
             self._waiting.pop(min(self._waiting))
         return found
-
-
-def _same_camera(a: Camera, b: Camera) -> bool:
-    return np.array_equal(a.K, b.K) and (a.width, a.height) == (b.width, b.height)
 
 
 def deserialize(data: bytes, kind: str, where: Path) -> Any:

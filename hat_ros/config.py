@@ -43,7 +43,7 @@ class ClassicalConfig:
     """Segmentation without weights."""
 
     sky_border_share: float = option(0.7, "share of dark image border from which the background is black sky", low=0)
-    work_side_px: int = option(112, "longer side of the reduced crop of the region model", low=48, high=512)
+    work_side_px: int = option(96, "longer side of the reduced crop of the region model", low=48, high=512)
     cold_side_px: int = option(112, "longer side of the reduced image of a search from nothing", low=48, high=512)
     check_interval_frames: int = option(20, "frames between independent checks of a tracked mask", low=1)
     min_prior_overlap: float = option(0.6, "overlap with the mask below which a prior is not used", low=0, high=1)
@@ -144,8 +144,8 @@ class DroidConfig:
     frontend_nms: int = option(1, "edges keep others this far away in the plane of frame pairs", low=0, high=8)
     motion_damping: float = option(0.0, "share of the last motion in the guess of the next pose", low=0, high=1)
     readout_updates: int = option(3, "motion-only updates of the pose of a frame that is no keyframe", low=1, high=32)
-    published_back_substitution: bool = option(
-        True, "depths ignore the step of the first free pose, as in the released tracker; false: exact"
+    as_released: bool = option(
+        True, "keep two slips of the released tracker (depth back-substitution, context of the first frame)"
     )
     backend_threshold: float = option(22.0, "offline only: largest frame distance of a global edge", low=0)
     backend_radius: int = option(2, "offline only: neighbours in time that are always connected, less one", low=1)
@@ -247,6 +247,8 @@ class GraphConfig:
 
     credits_replay: int = option(4, "W: frames in flight during replay", low=1, high=16)
     stage_timeout_s: float = option(30.0, "a stage that does not answer in this time is an error", low=0.1)
+    startup_timeout_s: float = option(180.0, "a node that is not ready in this time is an error", low=1)
+    debug_stage_delay_ms: float = option(0.0, "for latency studies: random extra time per frame, at most this", low=0)
 
 
 @dataclass(frozen=True)

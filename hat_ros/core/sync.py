@@ -9,14 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from hat_ros.errors import FrameError
+from hat_ros.errors import FrameError, RunError
 
 
 class ExactJoin:
     """Joins one item of each named stream by exact stamp, and hands the joined sets out in stamp order.
-
-    A stamp for which a later one is already complete can never be completed (streams are FIFO), so it is abandoned
-    when the later one is taken, and counted in :attr:`abandoned`.
 
     Args:
         names: the streams.
@@ -25,8 +22,7 @@ class ExactJoin:
     def __init__(self, names: Sequence[str]) -> None:
         self._names = tuple(names)
         self._pending: dict[int, dict[str, Any]] = {}
-        self._newest_taken = -(2**63)
-        self.abandoned = 0
+        self._passed_ns = -(2**63)
         self.late = 0
 
     def __len__(self) -> int:
@@ -35,7 +31,7 @@ class ExactJoin:
 
     def put(self, name: str, stamp_ns: int, item: Any) -> None:
         """Add an item; one for a stamp that has been passed already is dropped and counted in :attr:`late`."""
-        if stamp_ns <= self._newest_taken:
+        if stamp_ns <= self._passed_ns:
             self.late += 1
             return
         self._pending.setdefault(stamp_ns, {})[name] = item
@@ -46,32 +42,36 @@ class ExactJoin:
         return (min(complete), self._pending[min(complete)]) if complete else None
 
     def take(self) -> tuple[int, dict[str, Any]]:
-        """Remove the earliest complete set and everything before it.
+        """Remove the earliest complete set.
 
         Raises:
             LookupError: there is none; ask :meth:`peek` first.
+            RunError: something of an earlier stamp is still missing. Streams are FIFO, so it never comes: it was lost.
         """
         head = self.peek()
         if head is None:
             raise LookupError("no complete set to take")
         stamp_ns, items = head
+        missing = self.missing()
+        if missing is not None and missing[0] < stamp_ns:
+            raise RunError(f"a message was lost: frame {missing[0]} never had {', '.join(missing[1])}")
         del self._pending[stamp_ns]
-        for stamp in [stamp for stamp in self._pending if stamp < stamp_ns]:
-            del self._pending[stamp]
-            self.abandoned += 1
-        self._newest_taken = stamp_ns
+        self._passed_ns = stamp_ns
         return stamp_ns, items
 
+    def drop_before(self, stamp_ns: int) -> None:
+        """Give up what waits for stamps before this one."""
+        for stamp in [stamp for stamp in self._pending if stamp < stamp_ns]:
+            del self._pending[stamp]
+        self._passed_ns = max(self._passed_ns, stamp_ns - 1)
+
     def missing(self) -> tuple[int, tuple[str, ...]] | None:
-        """The earliest incomplete stamp and the streams it still lacks; for diagnostics."""
-        waiting = sorted(stamp for stamp, items in self._pending.items() if len(items) < len(self._names))
+        """The earliest incomplete stamp and the streams it still lacks."""
+        waiting = [stamp for stamp, items in self._pending.items() if len(items) < len(self._names)]
         if not waiting:
             return None
-        return waiting[0], tuple(name for name in self._names if name not in self._pending[waiting[0]])
-
-    def clear(self) -> None:
-        """Forget what waits; stamps already taken stay passed."""
-        self._pending.clear()
+        stamp_ns = min(waiting)
+        return stamp_ns, tuple(name for name in self._names if name not in self._pending[stamp_ns])
 
 
 class Admission:

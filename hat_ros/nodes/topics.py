@@ -29,10 +29,14 @@ READY = "/hat/ready"
 END_OF_STREAM = "/hat/end_of_stream"
 RESET = "/hat/reset"
 
-# What a result bag holds: everything that the graph says, images excepted.
-RECORDED: dict[str, str] = {
+TYPES: dict[str, str] = {
+    IMAGE: "sensor_msgs/msg/Image",
+    IMAGE_COMPRESSED: "sensor_msgs/msg/CompressedImage",
+    CAMERA_INFO: "sensor_msgs/msg/CameraInfo",
+    DETECTION_MASK: "sensor_msgs/msg/Image",
     HAT_CAMERA_INFO: "sensor_msgs/msg/CameraInfo",
     ADMISSION: "sensor_msgs/msg/PointCloud2",
+    FRAME: "sensor_msgs/msg/Image",
     HYPOTHESES_SCORED: "sensor_msgs/msg/PointCloud2",
     HYPOTHESES: "geometry_msgs/msg/PoseArray",
     SLAM_STATE: "sensor_msgs/msg/PointCloud2",
@@ -44,8 +48,30 @@ RECORDED: dict[str, str] = {
     STATUS: "sensor_msgs/msg/PointCloud2",
     TARGET_POSE: "geometry_msgs/msg/PoseStamped",
     TARGET_POSE_WITH_COVARIANCE: "geometry_msgs/msg/PoseWithCovarianceStamped",
+    TF: "tf2_msgs/msg/TFMessage",
+    OVERLAY: "sensor_msgs/msg/CompressedImage",
     DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
+    READY: "std_msgs/msg/Header",
+    END_OF_STREAM: "std_msgs/msg/Header",
 }
+
+# What a result bag holds: everything that the graph says, images excepted.
+RECORDED = (
+    HAT_CAMERA_INFO,
+    ADMISSION,
+    HYPOTHESES_SCORED,
+    HYPOTHESES,
+    SLAM_STATE,
+    SLAM_ODOMETRY,
+    SELECTION,
+    ANCHOR,
+    ALIGNMENT,
+    ALIGNMENT_TRANSFORM,
+    STATUS,
+    TARGET_POSE,
+    TARGET_POSE_WITH_COVARIANCE,
+    DIAGNOSTICS,
+)
 
 # Columns of the table topics, in order; all FLOAT64.
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")

@@ -106,7 +106,7 @@ class Wire:
             out.frombytes(data)
             return out
 
-        return cls(_ros_class, octets, lambda values: array.array("d", values))
+        return cls(message_class, octets, lambda values: array.array("d", values))
 
     @classmethod
     def bag(cls, typestore: Any) -> Wire:
@@ -313,7 +313,8 @@ class Wire:
 
 
 @cache
-def _ros_class(name: str) -> type:
+def message_class(name: str) -> type:
+    """rclpy's class of a full type name, ``package/msg/Name``."""
     package, kind, short = name.split("/")
     return getattr(import_module(f"{package}.{kind}"), short)
 
@@ -493,6 +494,13 @@ def camera_from(message: Any) -> Camera:
     if message.binning_x > 1 or message.binning_y > 1 or message.roi.width or message.roi.height:
         raise FrameError("camera_info has binning or a region of interest: give the calibration of the image as it is")
     return Camera(np.array(message.k, dtype=np.float64).reshape(3, 3), int(message.width), int(message.height))
+
+
+def same_camera(a: Camera | None, b: Camera | None) -> bool:
+    """Whether two calibrations are identical."""
+    if a is None or b is None:
+        return a is b
+    return np.array_equal(a.K, b.K) and (a.width, a.height) == (b.width, b.height)
 
 
 def frame_from(message: Any) -> tuple[NDArray[np.uint8], Detection | None]:

@@ -1,0 +1,316 @@
+"""What all nodes share: lifecycle, parameters, endpoints that know whether they are matched, diagnostics, the end.
+
+rclpy swallows exceptions of lifecycle callbacks and stops an executor on those of others, so both are caught here,
+once: a node that fails says so in one sentence, in ``/diagnostics`` and on stderr, and the process ends in a replay.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, ClassVar
+
+import rclpy
+from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
+
+from hat_ros.errors import HatError, RunError
+from hat_ros.nodes import qos, topics
+from hat_ros.nodes.environment import prepare_environment
+from hat_ros.nodes.params import declare_parameters
+from hat_ros.nodes.wire import Wire, message_class, stamp_of
+
+OK, WARN, ERROR = 0, 1, 2
+_ACK_TIMEOUT_S = 10.0
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+
+
+class HatNode(LifecycleNode):
+    """A lifecycle node in ``/hat``. Subclasses build themselves in :meth:`configure` and take apart in :meth:`cleanup`.
+
+    Attributes:
+        settings: the values of all parameters.
+        wire: encodes messages.
+        active: the lifecycle state is active; messages that arrive otherwise are dropped.
+        failure: what stopped the node, None while all is well.
+        finished: the stream ended and everything sent was acknowledged.
+    """
+
+    NAME: ClassVar[str]
+    EXTRA_PARAMETERS: ClassVar[dict[str, tuple[Any, str]]] = {}
+
+    def __init__(self, *, context: rclpy.Context | None = None, parameters: dict[str, Any] | None = None) -> None:
+        super().__init__(
+            self.NAME,
+            namespace="/hat",
+            context=context,
+            parameter_overrides=[Parameter(name, value=value) for name, value in (parameters or {}).items()],
+            automatically_declare_parameters_from_overrides=True,
+        )
+        self.settings = declare_parameters(self, self.EXTRA_PARAMETERS)
+        self.wire = Wire.ros()
+        self.active = self.finished = False
+        self.failure: HatError | None = None
+        self._outputs: dict[str, tuple[Any, tuple[str, ...]]] = {}
+        self._inputs: dict[str, Any] = {}
+        self._writers: dict[str, int] = {}
+        self._announced = False
+        self._level, self._text = OK, "unconfigured"
+        self._ready = self.create_publisher(message_class(topics.TYPES[topics.READY]), topics.READY, qos.LATCH)
+        self._diagnostics = self.create_publisher(
+            message_class(topics.TYPES[topics.DIAGNOSTICS]), topics.DIAGNOSTICS, qos.OUT
+        )
+        self.create_timer(1.0, self._every_second, clock=STEADY)
+        self.create_timer(0.02, self._announce, clock=STEADY)
+
+    # ------------------------------------------------------------ for subclasses
+
+    def configure(self) -> None:
+        """Build what the node owns and create its endpoints."""
+        raise NotImplementedError
+
+    def cleanup(self) -> None:
+        """Drop what :meth:`configure` built; endpoints go by themselves."""
+
+    def release(self) -> None:
+        """Close what outlives the process (files); may be called more than once."""
+
+    def values(self) -> dict[str, Any]:
+        """Figures for diagnostics."""
+        return {}
+
+    def every_second(self) -> None:
+        """Called once a second while active."""
+
+    def output(self, topic: str, *readers: str) -> Any:
+        """A publisher that is ready once the named nodes (and the recorder, if there is one) have been matched."""
+        if self.settings.recorded and topic in topics.RECORDED:
+            readers = (*readers, "recorder")
+        profile = qos.profile_of(topic, self.settings.live)
+        publisher = self.create_lifecycle_publisher(message_class(topics.TYPES[topic]), topic, profile)
+        self._outputs[topic] = (publisher, readers)
+        return publisher
+
+    def input(
+        self,
+        topic: str,
+        callback: Callable[..., None],
+        *,
+        profile: QoSProfile | None = None,
+        required: bool = True,
+        raw: bool = False,
+        with_info: bool = False,
+    ) -> None:
+        """Subscribe; the node is ready once a publisher is matched, unless the input is not required."""
+        self._writers[topic] = 0 if required else 1
+
+        def matched(event: Any) -> None:
+            if required:
+                self._writers[topic] = event.current_count
+
+        # rclpy looks at the signature to decide whether a callback wants the message's info.
+        plain, informed = (lambda message: guarded(message)), (lambda message, info: guarded(message, info))
+        guarded = partial(self.guarded, callback)
+        self._inputs[topic] = self.create_subscription(
+            message_class(topics.TYPES[topic]),
+            topic,
+            informed if with_info else plain,
+            profile or qos.profile_of(topic, self.settings.live),
+            event_callbacks=SubscriptionEventCallbacks(matched=matched),
+            raw=raw,
+        )
+
+    def guarded(self, callback: Callable[..., None], *args: Any) -> None:
+        """Run a callback while active; an exception becomes a failure with one sentence."""
+        if not self.active:
+            return
+        try:
+            callback(*args)
+        except HatError as error:
+            self.fail(error)
+        except Exception as error:
+            self.get_logger().error(traceback.format_exc())
+            self.fail(RunError(f"{type(error).__name__}: {error}"))
+
+    def fail(self, error: HatError) -> None:
+        """Say what went wrong; a replay ends, a live graph goes on (its next epoch starts without this frame)."""
+        self.get_logger().error(str(error))
+        self.report(ERROR, str(error))
+        if not self.settings.live or not self.active:
+            self.failure = error
+
+    def report(self, level: int, text: str) -> None:
+        """Set the state shown in diagnostics; published at once when it changes."""
+        if (level, text) != (self._level, self._text):
+            self._level, self._text = level, text
+            self._publish_diagnostics()
+
+    # ------------------------------------------------------------ readiness
+
+    def is_matched(self) -> bool:
+        """Whether every endpoint knows its counterparts, so that nothing sent from now on is lost."""
+        return all(self._writers.values()) and all(self._has_readers(topic) for topic in self._outputs)
+
+    def _has_readers(self, topic: str) -> bool:
+        publisher, names = self._outputs[topic]
+        if not names:
+            return True
+        mine = qos.profile_of(topic, self.settings.live)
+        found = [
+            info
+            for info in self.get_subscriptions_info_by_topic(topic)
+            if qos_check_compatible(mine, info.qos_profile)[0] != QoSCompatibility.ERROR
+        ]
+        return set(names) <= {info.node_name for info in found} and publisher.get_subscription_count() >= len(found)
+
+    def _announce(self) -> None:
+        if self.active and not self._announced and self.is_matched():
+            self._announced = True
+            self._ready.publish(self.wire.header(time.time_ns(), self.NAME))
+            self.report(OK, "ready")
+
+    # ------------------------------------------------------------ diagnostics, end
+
+    def _every_second(self) -> None:
+        supervisor = self.settings.supervisor_pid
+        if supervisor and os.getppid() != supervisor:
+            self.failure = RunError(f"process {supervisor}, which had started this node, is gone")
+        if self.active:
+            self.guarded(self.every_second)
+        self._publish_diagnostics()
+
+    def _publish_diagnostics(self) -> None:
+        name = f"hat: {self.NAME}"
+        message = self.wire.diagnostics(time.time_ns(), name, self._level, self._text, self.values())
+        self._diagnostics.publish(message)
+
+    def _on_end_of_stream(self, message: Any) -> None:
+        """The last status is out: make sure that everything sent has arrived."""
+        stuck = [topic for topic in self._outputs if not self._acknowledged(topic)]
+        if stuck:
+            self.fail(RunError(f"not acknowledged by all readers at the end of the stream: {', '.join(stuck)}"))
+        self.report(OK, f"end of stream at {stamp_of(message)}")
+        self.finished = self.settings.exit_at_end
+
+    def _acknowledged(self, topic: str) -> bool:
+        return self._outputs[topic][0].wait_for_all_acked(Duration(seconds=_ACK_TIMEOUT_S))
+
+    # ------------------------------------------------------------ lifecycle
+
+    def on_configure(self, state: Any) -> TransitionCallbackReturn:
+        """Build the stage and its endpoints."""
+        outcome = self._transition(self._configure)
+        return outcome if outcome != TransitionCallbackReturn.SUCCESS else super().on_configure(state)
+
+    def _configure(self) -> None:
+        self.failure = None
+        self.configure()
+        self.input(topics.END_OF_STREAM, self._on_end_of_stream, profile=qos.LATCH_READER, required=False)
+        self.report(OK, "inactive")
+
+    def on_activate(self, state: Any) -> TransitionCallbackReturn:
+        """Accept messages from now on."""
+        self.active = True
+        self.report(OK, "waiting for the other nodes")
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: Any) -> TransitionCallbackReturn:
+        """Drop messages from now on."""
+        self.active = self._announced = False
+        self.report(OK, "inactive")
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: Any) -> TransitionCallbackReturn:
+        """Drop endpoints and stage."""
+        outcome = self._transition(self._cleanup)
+        return outcome if outcome != TransitionCallbackReturn.SUCCESS else super().on_cleanup(state)
+
+    def on_shutdown(self, state: Any) -> TransitionCallbackReturn:
+        """Like cleanup, for good."""
+        self.active = False
+        return self._transition(self._cleanup)
+
+    def _cleanup(self) -> None:
+        for subscription in self._inputs.values():
+            self.destroy_subscription(subscription)
+        for publisher, _ in self._outputs.values():
+            self.destroy_lifecycle_publisher(publisher)
+        self._inputs.clear()
+        self._outputs.clear()
+        self._writers.clear()
+        self.cleanup()
+        self.report(OK, "unconfigured")
+
+    def _transition(self, action: Callable[[], None]) -> TransitionCallbackReturn:
+        try:
+            action()
+        except HatError as error:
+            self.fail(error)
+            return TransitionCallbackReturn.FAILURE
+        except Exception as error:
+            self.get_logger().error(traceback.format_exc())
+            self.fail(RunError(f"{type(error).__name__}: {error}"))
+            return TransitionCallbackReturn.ERROR
+        return TransitionCallbackReturn.SUCCESS
+
+    def start(self) -> None:
+        """Configure and activate, as a lifecycle manager would."""
+        if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+            self.trigger_activate()
+
+
+def spin(executor: SingleThreadedExecutor, nodes: Sequence[HatNode]) -> HatError | None:
+    """Run nodes until all have finished, one has failed, or the process is asked to end; the failure if any."""
+    try:
+        while not all(node.finished for node in nodes):
+            failed = next((node for node in nodes if node.failure is not None), None)
+            if failed is not None:
+                return failed.failure
+            executor.spin_once(timeout_sec=0.2)
+    except (ExternalShutdownException, KeyboardInterrupt):
+        pass
+    return None
+
+
+def close(executor: SingleThreadedExecutor, nodes: Sequence[HatNode]) -> None:
+    """Take nodes apart, also after the context was shut down by a signal: what they hold open must be closed."""
+    executor.shutdown()
+    for node in nodes:
+        node.active = False
+        node.release()
+        node.destroy_node()
+
+
+def main(node_classes: Sequence[type[HatNode]], args: Sequence[str] | None = None) -> int:
+    """Entry point of every node process: 0 done, 1 failed, 2 bad input, with one sentence on stderr."""
+    prepare_environment()
+    context = rclpy.Context()
+    rclpy.init(args=list(sys.argv if args is None else args), context=context)
+    executor = SingleThreadedExecutor(context=context)
+    nodes: list[HatNode] = []
+    try:
+        for node_class in node_classes:
+            node = node_class(context=context)
+            nodes.append(node)
+            executor.add_node(node)
+            if node.settings.autostart:
+                node.start()
+        failure = spin(executor, nodes)
+    except HatError as error:
+        failure = error
+    finally:
+        close(executor, nodes)
+        context.try_shutdown()
+    if failure is not None:
+        print(failure, file=sys.stderr)
+        return failure.exit_code
+    return 0

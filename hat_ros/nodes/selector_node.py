@@ -1,0 +1,45 @@
+"""Stage 3 as a node: candidates and motion in, ``/hat/selection`` out, at every frame."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from hat_ros.core.selector import SelectorStage
+from hat_ros.nodes import base, topics, wire
+from hat_ros.nodes.stage_node import StageNode
+
+
+class SelectorNode(StageNode):
+    """Decodes which candidate is the anchor."""
+
+    NAME = "selector"
+    JOINED = (topics.HYPOTHESES_SCORED, topics.SLAM_STATE)
+
+    def configure(self) -> None:
+        """Build the stage and its endpoints."""
+        super().configure()
+        self._selection = self.output(topics.SELECTION, "fusion")
+        self._anchor = self.output(topics.ANCHOR)
+
+    def create_stage(self) -> SelectorStage:
+        """The stage object."""
+        return SelectorStage(self.settings.config.selector)
+
+    def step(self, stamp_ns: int, frame_id: str, admitted: wire.Admitted, items: dict[str, Any]) -> None:
+        """Selection of one frame."""
+        candidates = wire.candidates_from(items[topics.HYPOTHESES_SCORED])
+        selection = self.stage.update(candidates, wire.motion_from(items[topics.SLAM_STATE]))
+        self._selection.publish(self.wire.selection(stamp_ns, frame_id, selection))
+        if selection.selected >= 0:
+            row = selection.candidates.pose_rows[selection.selected]
+            self._anchor.publish(self.wire.pose(stamp_ns, frame_id, row))
+
+
+def main() -> int:
+    """Console script."""
+    return base.main([SelectorNode])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,21 @@
+"""All five stage nodes in one process and one executor: ``python -m hat_ros.nodes.single``."""
+
+from __future__ import annotations
+
+import sys
+
+from hat_ros.nodes import base
+from hat_ros.nodes.fusion_node import FusionNode
+from hat_ros.nodes.hypotheses_node import HypothesesNode
+from hat_ros.nodes.segmentation_node import SegmentationNode
+from hat_ros.nodes.selector_node import SelectorNode
+from hat_ros.nodes.slam_node import SlamNode
+
+
+def main() -> int:
+    """Run the graph; ends like a single node does."""
+    return base.main([SegmentationNode, HypothesesNode, SlamNode, SelectorNode, FusionNode])
+
+
+if __name__ == "__main__":
+    sys.exit(main())
