@@ -70,6 +70,15 @@ class _Window:
         )
 
 
+@dataclass(frozen=True)
+class _Found:
+    """What a search from nothing found: full-resolution mask, overlap with the nearest CAD silhouette, colours."""
+
+    mask: Mask
+    shape_overlap: float
+    models: region.ColorModels
+
+
 class ClassicalSegmenter:
     """See the module's text.
 
@@ -88,6 +97,7 @@ class ClassicalSegmenter:
         """Forget the previous masks."""
         self._mask: Mask | None = None  # of the previous frame
         self._before: Mask | None = None  # of the frame before that
+        self._models = region.ColorModels()
         self._since_check = 0
         self._failures = 0
         self._wait = 0
@@ -172,8 +182,13 @@ class ClassicalSegmenter:
             self._wait = min(2**self._failures, _MAX_RETRY_FRAMES) - 1
             return None
         self._failures = 0
+        return self._adopt(found)
+
+    def _adopt(self, found: _Found) -> Mask:
+        """Go on from what a search found."""
         self._since_check = 0
-        return found[0]
+        self._models = found.models
+        return found.mask
 
     def _track(self, frame: Frame, prior: PosePrior | None) -> tuple[Mask | None, bool]:
         """Follow the previous mask into this frame; the predicted silhouette helps while the two agree.
@@ -202,7 +217,7 @@ class ClassicalSegmenter:
         seeds = [window.reduce(self._mask, (dx, dy))]
         if silhouette is not None:
             seeds.insert(0, window.reduce(silhouette))
-        cut = region.cut_from_seeds(window.rgb, seeds, margin * window.scale)
+        cut = region.cut_from_seeds(window.rgb, seeds, margin * window.scale, self._models)
         if cut is None:
             return None, aided
         grown = np.count_nonzero(cut) / max(1, np.count_nonzero(seeds[-1]))
@@ -227,15 +242,15 @@ class ClassicalSegmenter:
         A mask held in place by a prediction is given up only for one that means something else.
         """
         found = self._search(frame, _touched_sides(tracked))
-        if found is not None and aided and _overlap(found[0], tracked) >= _AGREEMENT:
+        if found is not None and aided and _overlap(found.mask, tracked) >= _AGREEMENT:
             return tracked
         shape = self._bank.overlap(_shrink(tracked))
-        if found is not None and found[1] > shape + (_CLEARLY_BETTER if aided else 0.0):
-            return found[0]
+        if found is not None and found.shape_overlap > shape + (_CLEARLY_BETTER if aided else 0.0):
+            return self._adopt(found)
         return tracked if shape >= self._config.min_shape_overlap else None
 
-    def _search(self, frame: Frame, open_sides: tuple[str, ...]) -> tuple[Mask, float] | None:
-        """Find the target from nothing: the mask and its overlap with the nearest CAD silhouette."""
+    def _search(self, frame: Frame, open_sides: tuple[str, ...]) -> _Found | None:
+        """Find the target from nothing."""
         whole = self._window(frame, (0, 0, frame.camera.width, frame.camera.height), 0.0, self._config.cold_side_px)
         if whole is None:
             return None
@@ -255,8 +270,9 @@ class ClassicalSegmenter:
         window = self._window(frame, (x, y, x + w, y + h), 2.5 * margin)
         if window is None:
             return None
-        cut = region.cut_from_seeds(window.rgb, [window.reduce(mask)], margin * window.scale)
-        return None if cut is None else (self._finish(frame, window, cut), best_shape)
+        models = region.ColorModels()
+        cut = region.cut_from_seeds(window.rgb, [window.reduce(mask)], margin * window.scale, models)
+        return None if cut is None else _Found(self._finish(frame, window, cut), best_shape, models)
 
     def _finish(self, frame: Frame, window: _Window, cut: Mask) -> Mask:
         """Outline at full resolution, in a mask of the image's size."""
@@ -335,8 +351,9 @@ def _shadowed(silhouette: Mask, lit: Mask) -> Mask:
 
 
 def _centroid(mask: Mask) -> NDArray[np.float64]:
-    m = cv2.moments(mask, binaryImage=True)
-    return np.array([m["m10"], m["m01"]]) / m["m00"]
+    x, y, w, h = cv2.boundingRect(mask)
+    m = cv2.moments(mask[y : y + h, x : x + w], binaryImage=True)
+    return np.array([x + m["m10"] / m["m00"], y + m["m01"] / m["m00"]])
 
 
 def _touched_sides(mask: Mask) -> tuple[str, ...]:

@@ -6,6 +6,8 @@ what is known; :mod:`hat_ros.segmentation.boundary` then finds the outline at fu
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -20,19 +22,32 @@ _PIECE_SHARE = 0.03  # pieces smaller than this share of the largest are not the
 _SIDES = ("top", "bottom", "left", "right")
 
 
-def graph_cut(rgb: NDArray[np.uint8], labels: Mask, iterations: int) -> Mask | None:
-    """(h, w) 0/1 mask from GrabCut labels (cv2.GC_*); None when one side is empty."""
+@dataclass
+class ColorModels:
+    """Mixtures of five Gaussians in RGB for both sides, in GrabCut's own layout; adapted by every cut."""
+
+    background: NDArray[np.float64] = field(default_factory=lambda: np.zeros((1, 65)))
+    foreground: NDArray[np.float64] = field(default_factory=lambda: np.zeros((1, 65)))
+
+    @property
+    def learned(self) -> bool:
+        """Whether a cut has filled them."""
+        return bool(self.background.any() and self.foreground.any())
+
+
+def graph_cut(rgb: NDArray[np.uint8], labels: Mask, models: ColorModels, iterations: int) -> Mask | None:
+    """(h, w) 0/1 mask from GrabCut labels (cv2.GC_*), None when one side is empty; the models adapt to it."""
     foreground = int(np.count_nonzero(labels & 1))
     if foreground < 8 or labels.size - foreground < 8:
         return None
     labels = labels.copy()
-    models = np.zeros((1, 65)), np.zeros((1, 65))
+    mode = cv2.GC_EVAL if models.learned else cv2.GC_INIT_WITH_MASK
     cv2.setRNGSeed(0)  # its k-means draws from OpenCV's global generator
-    cv2.grabCut(rgb, labels, None, models[0], models[1], iterations, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(rgb, labels, None, models.background, models.foreground, iterations, mode)
     return labels & 1
 
 
-def cut_from_seeds(rgb: NDArray[np.uint8], seeds: list[Mask], margin_px: float) -> Mask | None:
+def cut_from_seeds(rgb: NDArray[np.uint8], seeds: list[Mask], margin_px: float, models: ColorModels) -> Mask | None:
     """Cut where seeds (0/1 masks of the same target) leave doubt.
 
     What all seeds contain, ``margin_px`` from their outlines, is target; what is that far outside all of them is
@@ -46,7 +61,7 @@ def cut_from_seeds(rgb: NDArray[np.uint8], seeds: list[Mask], margin_px: float) 
     maybe = cv2.dilate(some, kernel)
     labels = np.where(maybe > 0, np.where(seeds[0] > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD), cv2.GC_BGD)
     labels = np.where(sure > 0, cv2.GC_FGD, labels).astype(np.uint8)
-    cut = graph_cut(rgb, labels, 1)
+    cut = graph_cut(rgb, labels, models, 1)
     return None if cut is None else tidy(cut, every)
 
 
@@ -69,7 +84,7 @@ def cut_from_nothing(rgb: NDArray[np.uint8], open_sides: tuple[str, ...] = ()) -
         views[side](ring)[:] = cv2.GC_BGD
     for side in open_sides:
         views[side](3 * ring)[:] = cv2.GC_PR_FGD
-    cut = graph_cut(rgb, labels, _COLD_ITERATIONS)
+    cut = graph_cut(rgb, labels, ColorModels(), _COLD_ITERATIONS)
     return None if cut is None else tidy(cut, None)
 
 
