@@ -165,7 +165,7 @@ def bundle_adjust(
             step, depth_step = _eliminate(system, layout, damping, rule, eta, disparities, sensed)
             disparities = _moved_disparities(disparities, depth_step, layout, rule)
         poses = poses.index_copy(0, layout.free, retract(poses[layout.free], step))
-    return poses, disparities
+    return poses, disparities if motion_only else disparities.clamp_min(rule.min_disparity)
 
 
 @dataclass(frozen=True)
@@ -316,4 +316,4 @@ def _moved_disparities(disparities: Tensor, step: Tensor, layout: BundleLayout, 
     moved = disparities.index_add(0, layout.frames, step.view(layout.n_frames, *disparities.shape[-2:]))
     if rule.max_disparity < float("inf"):
         moved = torch.where(moved > rule.max_disparity, torch.zeros_like(moved), moved)
-    return moved.clamp_min(rule.min_disparity)
+    return moved
