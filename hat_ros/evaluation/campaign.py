@@ -110,9 +110,12 @@ def run_campaign(
         Outcomes in the order of ``jobs``.
 
     Raises:
+        ConfigError: a job's configuration is bad; nothing runs then.
         RunError: the campaign folder cannot be written.
         MissingDependencyError: a scheduler is asked for but ``distributed`` is not installed.
     """
+    for job in jobs:
+        job.fingerprint()
     runs = out / "runs"
     try:
         runs.mkdir(parents=True, exist_ok=True)

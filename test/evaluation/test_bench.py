@@ -1,0 +1,173 @@
+"""Campaigns: resumable, isolated failures, tables with the same bytes."""
+
+import json
+from pathlib import Path
+
+import pytest
+from scripted import CAMERA, frame, stamp, true_row
+
+from hat_ros import lie
+from hat_ros.bag import BagWriter
+from hat_ros.datasets.models import write_model
+from hat_ros.errors import MissingDependencyError, UsageError
+from hat_ros.evaluation import campaign
+from hat_ros.evaluation.bench import bench_jobs, bench_table, failures, stage_table
+from hat_ros.evaluation.campaign import Job, run_campaign
+from hat_ros.results import METRICS_FILE, RUN_FILE
+
+
+@pytest.fixture
+def clips(tmp_path):
+    model = tmp_path / "cubesat.glb"
+    write_model("cubesat", model)
+    for name in ("one", "two"):
+        with BagWriter(tmp_path / name, image_format="png") as writer:
+            for i in range(3):
+                T = lie.matrix_from_row(true_row(i))
+                writer.write_frame(stamp(i), frame(i).rgb, CAMERA, T_cam_target=T)
+            writer.write_target(model)
+    (tmp_path / "settings.yaml").write_text("keyframes: {gap_frames: 6}\n")
+    return [str(tmp_path / "one"), str(tmp_path / "two")]
+
+
+@pytest.fixture
+def fake_runs(monkeypatch):
+    """Runs that take no time: each writes what a real one would write; `log` counts them, `broken` fails."""
+    log: list[str] = []
+    broken: set[str] = set()
+
+    class Done:
+        def __init__(self, returncode, stderr):
+            self.returncode, self.stderr = returncode, stderr
+
+    def run(command, **_):
+        folder = Path(command[command.index("--out") + 1])
+        log.append(folder.name)
+        if folder.name in broken:
+            return Done(2, "Traceback ...\nhat: the bag is damaged\n")
+        folder.mkdir(parents=True, exist_ok=True)
+        job = next(job for job in jobs_by_name.values() if job.name == folder.name)
+        (folder / RUN_FILE).write_text(json.dumps(job.fingerprint()))
+        figures = {"frames": 3, "valid": 3, "E_p_mean": len(log) / 10, "fps": 20.0 + len(log), "coverage": 1.0}
+        (folder / METRICS_FILE).write_text(json.dumps(figures))
+        return Done(0, "")
+
+    jobs_by_name: dict[str, Job] = {}
+    monkeypatch.setattr(campaign.subprocess, "run", run)
+    return log, broken, jobs_by_name
+
+
+def make(clips, registry, **options):
+    settings = {"modes": ["hat", "independent"], "masks": ["own"], "starts": [0]} | options
+    settings.setdefault("config", str(Path(clips[0]).parent / "settings.yaml"))
+    jobs = bench_jobs(clips, **settings)
+    registry.update({job.name: job for job in jobs})
+    return jobs
+
+
+def test_jobs_cover_every_combination_once(clips):
+    jobs = bench_jobs(clips, ["hat", "independent"], ["own", "given"], [0, 60], "default", ["keyframes.gap_frames=3"])
+    assert len(jobs) == len({job.name for job in jobs}) == 2 * 2 * 2 * 2
+    given = [job for job in jobs if job.labels["masks"] == "given"]
+    assert all("segmentation.backend=annotated" in job.overrides for job in given)
+    assert all("keyframes.gap_frames=3" in job.overrides for job in jobs)
+    assert {job.start for job in jobs} == {0, 60}
+
+
+def test_one_clip_may_have_settings_of_its_own(clips):
+    jobs = bench_jobs(
+        [clips[0], f"{clips[1]}@slam.masked=false,keyframes.gap_frames=2"], ["hat"], ["own"], [0], "default"
+    )
+    assert jobs[0].overrides == ()
+    assert jobs[1].overrides == ("slam.masked=false", "keyframes.gap_frames=2")
+
+
+def test_missing_or_ambiguous_clips_are_refused(clips, tmp_path):
+    with pytest.raises(UsageError, match="no such file"):
+        bench_jobs([str(tmp_path / "three")], ["hat"], ["own"], [0], "default")
+    with pytest.raises(UsageError, match="two recordings are called one"):
+        bench_jobs([clips[0], clips[0]], ["hat"], ["own"], [0], "default")
+
+
+def test_killed_and_resumed_campaign_gives_the_same_table_byte_for_byte(clips, fake_runs, tmp_path, monkeypatch):
+    log, _, registry = fake_runs
+    jobs = make(clips, registry)
+    out = tmp_path / "bench"
+
+    one_run = campaign.subprocess.run
+
+    def killed(command, **options):
+        if len(log) == 2:
+            raise KeyboardInterrupt
+        return one_run(command, **options)
+
+    monkeypatch.setattr(campaign.subprocess, "run", killed)
+    with pytest.raises(KeyboardInterrupt):
+        run_campaign(jobs, out)
+    assert len(log) == 2
+    monkeypatch.setattr(campaign.subprocess, "run", one_run)
+    first = run_campaign(jobs, out)
+    assert len(log) == len(jobs), "what was done is used again"
+    again = run_campaign(jobs, out, n_jobs=3)
+    assert len(log) == len(jobs)
+    assert all(outcome.reused for outcome in again)
+    for table in (bench_table, stage_table):
+        assert table(first).csv() == table(again).csv()
+        assert table(first).text() == table(again).text()
+
+
+def test_failure_is_isolated_and_listed(clips, fake_runs, tmp_path):
+    log, broken, registry = fake_runs
+    jobs = make(clips, registry)
+    broken.add(jobs[1].name)
+    outcomes = run_campaign(jobs, tmp_path / "bench", n_jobs=2)
+    assert [outcome.figures is None for outcome in outcomes] == [False, True, False, False]
+    assert failures(outcomes) == [f"{jobs[1].name}: hat: the bag is damaged"]
+    assert "Traceback" in (tmp_path / "bench" / "runs" / f"{jobs[1].name}.log").read_text()
+    assert len(bench_table(outcomes).rows) == 4
+    broken.clear()
+    run_campaign(jobs, tmp_path / "bench")
+    assert len(log) == len(jobs) + 1, "only the failed one runs again"
+
+
+@pytest.mark.parametrize("change", ["config", "limit", "recording", "code"])
+def test_a_run_is_used_again_only_if_nothing_that_decides_it_changed(clips, fake_runs, tmp_path, monkeypatch, change):
+    log, _, registry = fake_runs
+    run_campaign(make(clips[:1], registry, modes=["hat"]), tmp_path / "bench")
+    options = {"modes": ["hat"]}
+    if change == "config":
+        options["overrides"] = ["keyframes.gap_frames=9"]
+    elif change == "limit":
+        options["limit"] = 2
+    elif change == "recording":
+        (Path(clips[0]) / "note.txt").write_text("touched")
+        campaign._input_hash.cache_clear()
+    else:
+        monkeypatch.setattr(campaign, "code_hash", lambda: "other code")
+    run_campaign(make(clips[:1], registry, **options), tmp_path / "bench")
+    assert len(log) == 2
+
+
+def test_each_row_leads_to_its_run_folder(clips, fake_runs, tmp_path):
+    _, _, registry = fake_runs
+    outcomes = run_campaign(make(clips, registry), tmp_path / "bench")
+    for row in bench_table(outcomes).rows:
+        run = json.loads((tmp_path / "bench" / row["run"] / RUN_FILE).read_text())
+        assert {"source_sha256", "config_sha256", "code_sha256"} <= set(run)
+
+
+def test_scheduler_without_distributed_says_what_to_install(clips, tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "distributed", None)
+    jobs = make(clips, {})
+    with pytest.raises(MissingDependencyError, match=r"hat_ros\[cluster\]"):
+        run_campaign(jobs, tmp_path / "bench", scheduler="tcp://127.0.0.1:1")
+
+
+def test_bad_configuration_is_found_before_anything_runs(clips, fake_runs, tmp_path):
+    from hat_ros.errors import ConfigError
+
+    log, _, _ = fake_runs
+    jobs = make(clips, {}, overrides=["keyframes.gap=3"])
+    with pytest.raises(ConfigError, match="gap_frames"):
+        run_campaign(jobs, tmp_path / "bench")
+    assert log == []

@@ -1,0 +1,110 @@
+"""The in-process pipeline: admission, masks, timing; independent of any backend."""
+
+import numpy as np
+import pytest
+from scripted import CAMERA, ScriptedMethod, frame, mask, stamp
+
+from hat_ros.bag import BagWriter
+from hat_ros.datasets.models import write_model
+from hat_ros.errors import BagError, FrameError, UsageError
+from hat_ros.pipeline import MEASURED, WARMUP_FRAMES, Pipeline, latency_summary, open_source
+
+
+def run(frames, masks_given=False):
+    method = ScriptedMethod()
+    pipeline = Pipeline(method, masks_given)
+    return list(pipeline.run(frames)), pipeline, method
+
+
+def test_frames_pass_in_order():
+    done, pipeline, method = run(frame(i) for i in range(5))
+    assert [d.step.estimate.stamp_ns for d in done] == [stamp(i) for i in range(5)]
+    assert pipeline.rejected == 0
+    assert len(method.seen) == 5
+
+
+def test_duplicate_backward_and_malformed_frames_are_counted_and_change_nothing():
+    clean, _, _ = run(frame(i) for i in range(4))
+    dirty = [frame(0), frame(0), FrameError("black"), frame(1), frame(0), frame(2), frame(1), frame(3)]
+    done, pipeline, _ = run(dirty)
+    assert pipeline.rejected == 4
+    for a, b in zip(clean, done, strict=True):
+        np.testing.assert_array_equal(a.step.estimate.pose_row, b.step.estimate.pose_row)
+
+
+@pytest.mark.parametrize("bad_stamp", [0, -5])
+def test_stamp_that_is_no_time_is_rejected(bad_stamp):
+    first = frame(0)
+    object.__setattr__(first, "stamp_ns", bad_stamp)
+    done, pipeline, _ = run([first, frame(1)])
+    assert (len(done), pipeline.rejected) == (1, 1)
+
+
+def test_recorded_masks_reach_the_method_only_when_given():
+    given = np.where(mask(), 255, 0).astype(np.uint8)
+    for masks_given in (False, True):
+        done, _, method = run([frame(0, given)], masks_given)
+        assert (method.seen[0].given_mask is not None) == masks_given
+        assert done[0].mask_iou == 1.0, "they judge the method's own masks either way"
+
+
+def test_box_masks_are_no_silhouette_to_judge_by():
+    done, _, _ = run([frame(0, np.full((48, 64), 128, np.uint8))])
+    assert np.isnan(done[0].mask_iou)
+
+
+def test_latency_leaves_out_warm_up_and_counts_decoding_in_fps():
+    slow = (1000.0, 0.0, *([0.0] * 5), np.nan)
+    fast = (8.0, 2.0, 1.0, 2.0, 3.0, 0.5, 1.5, np.nan)
+    summary = latency_summary([slow] * WARMUP_FRAMES + [fast] * 50)
+    assert summary["fps"] == pytest.approx(100.0)
+    assert summary["latency_ms_p50"] == summary["latency_ms_p99"] == pytest.approx(8.0)
+    assert summary["motion_ms_mean"] == pytest.approx(3.0)
+    assert len(fast) == len(MEASURED)
+
+
+def test_latency_of_nothing_is_nan():
+    assert np.isnan(latency_summary([])["fps"])
+
+
+@pytest.fixture
+def bag(tmp_path):
+    model = tmp_path / "cubesat.glb"
+    write_model("cubesat", model)
+    with BagWriter(tmp_path / "clip", frame_id="nav_cam", image_format="png") as writer:
+        for i in range(4):
+            writer.write_frame(stamp(i), frame(i).rgb, CAMERA, T_cam_target=np.eye(4))
+        writer.write_frame(stamp(4), b"\xff\xd8 no picture", CAMERA)
+        writer.write_frame(stamp(5), frame(5).rgb, CAMERA)
+        writer.write_target(model)
+    return tmp_path / "clip"
+
+
+def test_bag_is_a_source_and_a_broken_image_does_not_end_it(bag):
+    source = open_source(bag)
+    assert source.frame_id == "nav_cam"
+    assert source.target.name == "cubesat"
+    assert sorted(source.truth_rows()) == [stamp(i) for i in range(4)]
+    done, pipeline, _ = run(source.frames())
+    assert [d.frame.stamp_ns for d in done] == [stamp(i) for i in (0, 1, 2, 3, 5)]
+    assert pipeline.rejected == 1
+
+
+def test_start_and_limit_pick_frames(bag):
+    source = open_source(bag)
+    stamps = [item.stamp_ns for item in source.frames(1, 2)]
+    assert stamps == [stamp(1), stamp(2)]
+    assert source.count(1, 2) == 2
+    assert source.count(5) == 1
+    assert source.count(50) == 0
+
+
+def test_what_is_no_recording_is_refused(tmp_path, bag):
+    with pytest.raises(UsageError, match="no such file"):
+        open_source(tmp_path / "nothing")
+    with pytest.raises(UsageError, match="neither a bag"):
+        open_source(tmp_path)
+    (bag / "target.yaml").unlink()
+    (bag / "manifest.json").unlink()
+    with pytest.raises(BagError, match=r"target\.yaml"):
+        open_source(bag)
