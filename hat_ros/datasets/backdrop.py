@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from hat_ros.render.embree import pixel_rays
 from hat_ros.types import Camera
@@ -152,6 +153,4 @@ def _fractal_noise(rng: np.random.Generator, slope: float) -> NDArray[np.float64
     frequency[0, 0] = np.inf
     spectrum = np.fft.rfft2(rng.standard_normal((_MAP_SIDE, _MAP_SIDE))) * frequency ** (-slope / 1.3)
     noise = np.fft.irfft2(spectrum, s=(_MAP_SIDE, _MAP_SIDE))
-    ranks = np.empty(noise.size)
-    ranks[np.argsort(noise, axis=None)] = np.linspace(0, 1, noise.size)
-    return ranks.reshape(noise.shape)
+    return ndtr((noise - noise.mean()) / noise.std())  # Gaussian to uniform

@@ -80,11 +80,14 @@ def _turn_panels(target: Target, part: NDArray[np.int32], part_area: NDArray[np.
         index = np.unique(target.faces[mine])
         points = target.vertices_m[index]
         center = 0.5 * (points.min(axis=0) + points.max(axis=0))
-        extents = np.sort(np.ptp((points - center) @ np.linalg.svd(points - center, full_matrices=False)[2].T, axis=0))
+        axes = np.linalg.svd(points - center, full_matrices=False)[2]  # the last one is the panel's normal
+        extents = np.ptp((points - center) @ axes.T, axis=0)
         arm = center - target.center_m
-        if extents[0] > _PANEL_THINNESS * extents[1] or np.linalg.norm(arm) < 0.1 * target.bounding_radius_m:
+        length = np.linalg.norm(arm)
+        # Plates that lie on the body have it along their normal; a wing holds it in its plane.
+        if extents[2] > _PANEL_THINNESS * extents[1] or abs(axes[2] @ arm) > 0.3 * length or length == 0:
             continue
-        R = lie.so3_exp(angle * arm / np.linalg.norm(arm))
+        R = lie.so3_exp(angle * arm / length)
         vertices[index] = (points - center) @ R.T + center
         normals[mine] = normals[mine] @ R.T.astype(np.float32)
     return replace(target, vertices_m=vertices, surface=replace(target.surface, corner_normal=normals))
