@@ -33,7 +33,7 @@ def _add_evaluate(commands: Commands) -> None:
 
 def _evaluate(arguments: argparse.Namespace) -> int:
     from hat_ros.cli.console import print_figures
-    from hat_ros.runner import evaluate_folder
+    from hat_ros.evaluation.folder import evaluate_folder
 
     evaluate_folder(arguments.folder, arguments.truth)
     print_figures(arguments.folder)
@@ -53,7 +53,7 @@ def _add_plot(commands: Commands) -> None:
 
 
 def _plot(arguments: argparse.Namespace) -> int:
-    from hat_ros.runner import plot_folder
+    from hat_ros.evaluation.folder import plot_folder
 
     for path in plot_folder(arguments.folder, arguments.out or arguments.folder / "plots", arguments.format):
         print(path)

@@ -13,15 +13,19 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-STATE_STYLE = {"TRACKING": "green", "COASTING": "yellow", "LOST": "red", "UNINITIALISED": "dim"}
+from hat_ros.types import TrackState
+
+STATE_STYLE = {
+    TrackState.UNINITIALISED: "dim",
+    TrackState.TRACKING: "green",
+    TrackState.COASTING: "yellow",
+    TrackState.LOST: "red",
+}
 
 
 @contextmanager
-def progress_of(title: str, quiet: bool) -> Iterator[Callable[..., None] | None]:
-    """A progress bar with frames per second and state; yields what to call after each frame, None when quiet."""
-    if quiet:
-        yield None
-        return
+def state_progress(title: str, quiet: bool) -> Iterator[Callable[[int, int, TrackState], None]]:
+    """A bar with frames per second and state; yields what to call with (frames done, frames in all, newest state)."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -30,20 +34,17 @@ def progress_of(title: str, quiet: bool) -> Iterator[Callable[..., None] | None]
         TextColumn("{task.fields[state]}"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True)) as progress:
+    with Progress(*columns, console=Console(stderr=True), disable=quiet) as progress:
         task = progress.add_task(title, total=None, fps=0.0, state="")
-        started = time.perf_counter()
+        started: list[float] = []
 
-        def watch(done: Any, total: int) -> None:
-            count = progress.tasks[0].completed + 1
-            state = done.step.estimate.state.name
-            progress.update(
-                task,
-                completed=count,
-                total=total,
-                fps=count / max(1e-9, time.perf_counter() - started),
-                state=f"[{STATE_STYLE[state]}]{state}[/]",
-            )
+        def watch(done: int, total: int, state: TrackState) -> None:
+            now = time.perf_counter()
+            if not started:
+                started.append(now)
+            fps = (done - 1) / (now - started[0]) if now > started[0] else 0.0
+            shown = f"[{STATE_STYLE[state]}]{state.name}[/]"
+            progress.update(task, completed=done, total=total, fps=fps, state=shown)
 
         yield watch
 

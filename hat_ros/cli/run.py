@@ -12,8 +12,64 @@ MODES = ("hat", "independent", "tracking", "offline")
 
 def add_commands(commands: Commands) -> None:
     """Register this group."""
+    _add_replay(commands)
     _add_track(commands)
     _add_temporal(commands)
+
+
+def _add_replay(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "replay",
+        help="a recorded bag through the five-node ROS graph",
+        description="Play a bag through the real ROS graph without losing a frame, record what it says, and write a "
+        "result folder.",
+    )
+    parser.add_argument("bag", type=Path, help="bag folder or .mcap file, with the CAD model and target.yaml beside it")
+    add_out(parser, "result folder to write")
+    add_config(parser)
+    parser.add_argument(
+        "--graph",
+        choices=("processes", "single"),
+        default="processes",
+        help="five processes, or all nodes in one (default: processes)",
+    )
+    parser.add_argument(
+        "--credits", type=positive, metavar="W", help="frames in flight (default: graph.credits_replay)"
+    )
+    parser.add_argument("--live", action="store_true", help="play in real time; frames are dropped, not queued")
+    parser.add_argument("--rate", type=float, default=1.0, metavar="X", help="speed of --live play (default: 1)")
+    _add_common(parser)
+    parser.set_defaults(command=_replay)
+
+
+def _add_common(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--start", type=natural, default=0, metavar="N", help="skip the first N frames (cold start)")
+    parser.add_argument("--limit", type=positive, metavar="N", help="process at most N frames")
+    parser.add_argument("--no-video", action="store_true", help="do not write the overlay video")
+    parser.add_argument("--no-report", action="store_true", help="do not write report.html")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar, no table")
+
+
+def _replay(arguments: argparse.Namespace) -> int:
+    from hat_ros.cli.console import print_figures, state_progress
+    from hat_ros.runner import ReplayOptions, replay_bag
+
+    options = ReplayOptions(
+        graph=arguments.graph,
+        credits=arguments.credits,
+        live=arguments.live,
+        rate=arguments.rate,
+        start=arguments.start,
+        limit=arguments.limit,
+        video=not arguments.no_video,
+        report=not arguments.no_report,
+        overwrite=arguments.overwrite,
+    )
+    with state_progress("replaying", arguments.quiet) as watch:
+        folder = replay_bag(arguments.bag, arguments.out, config_of(arguments), options, watch)
+    if not arguments.quiet:
+        print_figures(folder)
+    return 0
 
 
 def _add_track(commands: Commands) -> None:
@@ -33,18 +89,14 @@ def _add_track(commands: Commands) -> None:
         help="hat: the paper's method; independent: best hypothesis of every frame; tracking: refine the last pose; "
         "offline: all frames jointly, not causal (default: hat)",
     )
-    parser.add_argument("--start", type=natural, default=0, metavar="N", help="skip the first N frames (cold start)")
-    parser.add_argument("--limit", type=positive, metavar="N", help="process at most N frames")
-    parser.add_argument("--no-video", action="store_true", help="do not write the overlay video")
-    parser.add_argument("--no-report", action="store_true", help="do not write report.html")
-    parser.add_argument("--quiet", action="store_true", help="no progress bar, no table")
+    _add_common(parser)
     add_threads(parser)
     parser.set_defaults(command=_track)
 
 
 def _track(arguments: argparse.Namespace) -> int:
     limit_threads(arguments.threads)
-    from hat_ros.cli.console import print_figures, progress_of
+    from hat_ros.cli.console import print_figures, state_progress
     from hat_ros.runner import TrackOptions, track
 
     options = TrackOptions(
@@ -55,7 +107,7 @@ def _track(arguments: argparse.Namespace) -> int:
         report=not arguments.no_report,
         overwrite=arguments.overwrite,
     )
-    with progress_of("tracking", arguments.quiet) as watch:
+    with state_progress("tracking", arguments.quiet) as watch:
         folder = track(arguments.recording, arguments.out, config_of(arguments), options, watch)
     if not arguments.quiet:
         print_figures(folder)
