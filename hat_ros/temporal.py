@@ -133,7 +133,8 @@ def run_temporal(observations: Observations, config: HatConfig) -> TemporalResul
         motion = observations.motion(t)
         selection = selector.update(observations.candidates(t, config.hypotheses.guard), motion)
         estimate = fusion.update(_imageless_frame(t), None, motion, selection)
-        T_cam_target[t], held[t] = estimate.T_cam_target, estimate.state == TrackState.COASTING
+        if estimate.state.has_pose:
+            T_cam_target[t], held[t] = estimate.T_cam_target, estimate.state == TrackState.COASTING
         chosen[t], accepted[t], n_resets[t + 1] = selection.selected, selector.accepted, estimate.n_resets
     return TemporalResult(T_cam_target, chosen, accepted, np.flatnonzero(np.diff(n_resets)), held)
 
