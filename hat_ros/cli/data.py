@@ -41,6 +41,11 @@ def _add_import(commands: Commands) -> None:
     parser.add_argument(
         "--sequence", action="append", default=[], metavar="NAME", help="only this sequence (repeatable)"
     )
+    parser.add_argument(
+        "--boxes",
+        action="store_true",
+        help="give frames without a mask the box of the CAD at the true pose (as for SHIRT)",
+    )
     parser.add_argument("--check", action="store_true", help="also write a picture of the CAD projected by the labels")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(command=_import)
@@ -57,6 +62,7 @@ def _import(arguments: argparse.Namespace) -> int:
             arguments.out,
             model=arguments.model,
             sequences=arguments.sequence,
+            boxes=arguments.boxes,
             check=arguments.check,
             progress=watch,
         )
@@ -103,6 +109,15 @@ def _add_synth(commands: Commands) -> None:
     film.add_argument(
         "--asymmetry", type=float, default=1.0, metavar="0..1", help="of our own models; 0 makes them ambiguous"
     )
+    film.add_argument(
+        "--panel-turn", type=float, default=0.0, metavar="DEG", help="wings of the spacecraft, not of its CAD, turned"
+    )
+    film.add_argument(
+        "--recolor", type=float, default=0.0, metavar="0..1", help="colours of the spacecraft differ from its CAD"
+    )
+    film.add_argument(
+        "--missing", type=float, default=0.0, metavar="0..1", help="share of the CAD's parts that the spacecraft lacks"
+    )
     film.add_argument("--seed", type=natural, default=0, help="of noise, stars and textures")
     parser.set_defaults(command=_synth)
 
@@ -134,6 +149,7 @@ def _synth(arguments: argparse.Namespace) -> int:
 def _filmed(arguments: argparse.Namespace) -> Clip:
     """The clip that the options describe."""
     from hat_ros.datasets.backdrop import Earth
+    from hat_ros.datasets.mismatch import Mismatch
     from hat_ros.datasets.models import model_names
     from hat_ros.datasets.suite import CLIPS, Clip
     from hat_ros.datasets.synth import ClipSpec
@@ -159,4 +175,5 @@ def _filmed(arguments: argparse.Namespace) -> Clip:
         table=arguments.background == "table",
         seed=arguments.seed,
     )
-    return Clip(arguments.what, spec, arguments.asymmetry)
+    mismatch = Mismatch(arguments.panel_turn, arguments.recolor, arguments.missing, arguments.seed)
+    return Clip(arguments.what, spec, arguments.asymmetry, mismatch)
