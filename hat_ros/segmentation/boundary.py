@@ -28,7 +28,7 @@ def refine_outline(rgb: NDArray[np.uint8], mask: NDArray[np.uint8], band_px: int
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * band_px + 1, 2 * band_px + 1))
     inner = cv2.erode(mask, kernel, borderType=cv2.BORDER_REPLICATE)
     outer = cv2.dilate(mask, kernel, borderType=cv2.BORDER_REPLICATE)
-    moved = _decide(rgb, mask, inner, outer, band_px + 2, np.float32(contrast * contrast))
+    moved = _decide(rgb, mask, inner, outer, 2 * band_px + 2, np.float32(contrast * contrast))
     # A lone pixel that disagrees with most of its neighbours is noise.
     smooth = cv2.medianBlur(moved, 3)
     return np.where(inner == outer, mask, smooth)

@@ -31,6 +31,8 @@ _MARGIN_PX = 2.0
 _MAX_AREA_CHANGE = 1.6  # from one frame to the next
 _MIN_CONTINUITY = 0.6  # overlap of a tracked mask with its seed
 _MIN_CONTRAST = 8.0  # 8-bit colour step across the outline below which there is no outline
+_MIN_CONTRAST_KEPT = 0.4  # share of its usual contrast at which a tracked outline is lost
+_CONTRAST_GAIN = 0.2
 _AGREEMENT = 0.8  # overlap of two independent masks that mean the same
 _CLEARLY_BETTER = 0.025  # shape overlap by which one explanation must beat the simpler one
 _SECOND_REGION_SHARE = 0.2  # a second bright region this large makes the choice between them a question
@@ -72,10 +74,18 @@ class _Window:
 
 @dataclass(frozen=True)
 class _Found:
-    """What a search from nothing found: full-resolution mask, overlap with the nearest CAD silhouette, colours."""
+    """What a search from nothing found.
+
+    Attributes:
+        mask: (H, W) uint8 of 0 and 1.
+        shape_overlap: with the nearest CAD silhouette.
+        contrast: colour step across the outline.
+        models: colours of both sides.
+    """
 
     mask: Mask
     shape_overlap: float
+    contrast: float
     models: region.ColorModels
 
 
@@ -98,6 +108,7 @@ class ClassicalSegmenter:
         self._mask: Mask | None = None  # of the previous frame
         self._before: Mask | None = None  # of the frame before that
         self._models = region.ColorModels()
+        self._contrast = 0.0  # of the tracked outline, slowly following
         self._since_check = 0
         self._failures = 0
         self._wait = 0
@@ -188,6 +199,7 @@ class ClassicalSegmenter:
         """Go on from what a search found."""
         self._since_check = 0
         self._models = found.models
+        self._contrast = found.contrast
         return found.mask
 
     def _track(self, frame: Frame, prior: PosePrior | None) -> tuple[Mask | None, bool]:
@@ -223,8 +235,10 @@ class ClassicalSegmenter:
         grown = np.count_nonzero(cut) / max(1, np.count_nonzero(seeds[-1]))
         if not 1 / _MAX_AREA_CHANGE <= grown <= _MAX_AREA_CHANGE or _overlap(cut, seeds[0]) < _MIN_CONTINUITY:
             return None, aided
-        if region.edge_contrast(window.rgb, cut) < _MIN_CONTRAST:
+        contrast, _ = region.edge_contrast(window.rgb, cut)
+        if contrast < max(_MIN_CONTRAST, _MIN_CONTRAST_KEPT * self._contrast):
             return None, aided
+        self._contrast += _CONTRAST_GAIN * (contrast - self._contrast)
         return self._finish(frame, window, cut), aided
 
     def _shift(self) -> tuple[int, int]:
@@ -257,7 +271,10 @@ class ClassicalSegmenter:
         best, best_shape = None, self._config.min_shape_overlap
         for sides in ((), *((side,) for side in open_sides)):
             cut = region.cut_from_nothing(whole.rgb, sides)
-            if cut is None or region.edge_contrast(whole.rgb, cut) < _MIN_CONTRAST:
+            if cut is None:
+                continue
+            contrast, chance = region.edge_contrast(whole.rgb, cut)
+            if contrast < max(_MIN_CONTRAST, chance):
                 continue
             shape = self._bank.overlap(cut.astype(bool))
             if shape >= best_shape + (_CLEARLY_BETTER if best is not None else 0.0):
@@ -272,7 +289,10 @@ class ClassicalSegmenter:
             return None
         models = region.ColorModels()
         cut = region.cut_from_seeds(window.rgb, [window.reduce(mask)], margin * window.scale, models)
-        return None if cut is None else _Found(self._finish(frame, window, cut), best_shape, models)
+        if cut is None:
+            return None
+        contrast, _ = region.edge_contrast(window.rgb, cut)
+        return _Found(self._finish(frame, window, cut), best_shape, contrast, models)
 
     def _finish(self, frame: Frame, window: _Window, cut: Mask) -> Mask:
         """Outline at full resolution, in a mask of the image's size."""

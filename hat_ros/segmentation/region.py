@@ -103,16 +103,22 @@ def tidy(mask: Mask, anchor: Mask | None) -> Mask | None:
     return fill_holes(keep.astype(np.uint8)[label], 0.05)
 
 
-def edge_contrast(rgb: NDArray[np.uint8], mask: Mask) -> float:
-    """Lower quartile of the colour step (8-bit) across the mask's outline inside the image; 0 without an outline."""
+def edge_contrast(rgb: NDArray[np.uint8], mask: Mask) -> tuple[float, float]:
+    """How clearly the mask's outline shows.
+
+    Returns:
+        Lower quartile of the colour step (8-bit, across two pixels) along the outline inside the image, and upper
+        quartile of the steps in the background, where an outline drawn by chance would lie; zeros without an outline.
+    """
     outer = cv2.dilate(mask, np.ones((3, 3), np.uint8))
     inner = cv2.erode(mask, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
-    outline = (outer != inner).astype(np.uint8)
-    outline[0] = outline[-1] = 0
-    outline[:, 0] = outline[:, -1] = 0
-    rows, cols = np.nonzero(outline)
-    if rows.size < 8:
-        return 0.0
-    dx = cv2.Sobel(rgb, cv2.CV_32F, 1, 0, ksize=3)[rows, cols] / 4
-    dy = cv2.Sobel(rgb, cv2.CV_32F, 0, 1, ksize=3)[rows, cols] / 4
-    return float(np.percentile(np.sqrt((dx * dx + dy * dy).sum(axis=1)), 25))
+    outline = outer != inner
+    outline[0] = outline[-1] = False
+    outline[:, 0] = outline[:, -1] = False
+    away = cv2.dilate(mask, np.ones((7, 7), np.uint8)) == 0
+    if np.count_nonzero(outline) < 8:
+        return 0.0, 0.0
+    dx = cv2.Sobel(rgb, cv2.CV_32F, 1, 0, ksize=3, scale=0.25)
+    dy = cv2.Sobel(rgb, cv2.CV_32F, 0, 1, ksize=3, scale=0.25)
+    step = np.sqrt((dx * dx + dy * dy).sum(axis=2))
+    return float(np.percentile(step[outline], 25)), float(np.percentile(step[away], 75)) if away.any() else 0.0

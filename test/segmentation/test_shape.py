@@ -1,0 +1,49 @@
+import cv2
+import numpy as np
+import pytest
+
+from hat_ros.render import create_renderer
+from hat_ros.segmentation.shape import SilhouetteBank
+
+
+@pytest.fixture(scope="module")
+def bank(lopsided):
+    return SilhouetteBank(lopsided, create_renderer("embree", lopsided))
+
+
+def random_poses(scene, count):
+    rng = np.random.default_rng(3)
+    for _ in range(count):
+        yield scene.pose(rng.uniform(0, 6.3), *rng.uniform(-0.6, 0.6, 2), rng.uniform(5, 14))
+
+
+def test_every_view_of_the_model_is_plausible(bank, scene):
+    assert min(bank.overlap(scene.truth(T)) for T in random_poses(scene, 12)) > 0.8
+
+
+def test_views_cut_by_the_border_are_plausible(bank, scene):
+    for x, y in ((-2.2, 0), (2.2, 0.2), (0, 1.8), (0.2, -1.8)):
+        mask = scene.truth(scene.pose(0.7, x, y))
+        assert mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any()
+        assert bank.overlap(mask) > 0.75
+
+
+def test_position_size_and_roll_drop_out(bank, scene):
+    mask = scene.truth(scene.pose(0.7)).astype(np.uint8)
+    turn = cv2.getRotationMatrix2D((160, 120), 70, 0.7)
+    other = cv2.warpAffine(mask, turn, (320, 240), flags=cv2.INTER_NEAREST)
+    assert abs(bank.overlap(mask > 0) - bank.overlap(other > 0)) < 0.05
+
+
+def test_what_is_not_the_model_is_less_plausible(bank, scene):
+    worst = min(bank.overlap(scene.truth(T)) for T in random_poses(scene, 12))
+    ring = np.zeros((240, 320), np.uint8)
+    cv2.circle(ring, (160, 120), 60, 1, 10)
+    cross = np.zeros((240, 320), np.uint8)
+    cross[40:200, 150:170] = cross[110:130, 60:260] = 1
+    for mask in (ring, cross):
+        assert bank.overlap(mask > 0) < 0.6 < worst
+
+
+def test_nothing_is_not_plausible(bank):
+    assert bank.overlap(np.zeros((50, 60), bool)) == 0.0
