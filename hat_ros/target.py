@@ -257,6 +257,11 @@ def _material(material: Any) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | Non
     color = srgb_from_linear(factor / 255.0) if is_pbr else np.rint(factor).astype(np.uint8)
     if image is None:
         return color, None, roughness, metallic
+    if image.size[0] * image.size[1] > MAX_SOURCE_TEXTURE_PX:
+        raise MeshError(
+            f"CAD model: a texture of {image.size[0]}x{image.size[1]} px is larger than the accepted "
+            f"{MAX_SOURCE_TEXTURE_PX // 2**20} megapixels; scale it down"
+        )
     image = image.convert("RGB")
     if max(image.size) > MAX_TEXTURE_SIDE_PX:
         image.thumbnail((MAX_TEXTURE_SIDE_PX, MAX_TEXTURE_SIDE_PX))

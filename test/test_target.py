@@ -220,6 +220,32 @@ def test_absurd_extents_are_refused_with_advice(scale, says):
         target_from_scene(trimesh.Scene(box()), "huge", scale)
 
 
+def test_texture_bombs_are_refused_before_they_are_unpacked():
+    mesh = box()
+    mesh.visual = trimesh.visual.TextureVisuals(
+        uv=np.zeros((8, 2)), material=PBRMaterial(baseColorTexture=Image.new("1", (9000, 9000)))
+    )
+    with pytest.raises(MeshError, match="9000x9000 px"):
+        target_from_scene(trimesh.Scene(mesh), "bomb")
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "stl", "glb"])
+def test_damaged_bytes_give_a_model_or_a_clear_error(tmp_path, suffix):
+    path, rng = tmp_path / f"m.{suffix}", np.random.default_rng(0)
+    trimesh.creation.icosphere(subdivisions=1).export(path)
+    whole = path.read_bytes()
+    for _ in range(40):
+        data = bytearray(whole)
+        for place in rng.integers(len(data), size=3):
+            data[place] = rng.integers(32, 127)
+        path.write_bytes(data)
+        try:
+            target = load_target(path)
+        except MeshError:
+            continue
+        assert np.isfinite(target.vertices_m).all() and np.isfinite(target.diameter_m)
+
+
 def test_a_file_without_triangles_is_refused(tmp_path):
     path = tmp_path / "points.ply"
     trimesh.PointCloud(np.eye(3)).export(path)
