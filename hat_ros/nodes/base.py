@@ -21,13 +21,13 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from hat_ros.errors import HatError, RunError
 from hat_ros.nodes import qos, topics
 from hat_ros.nodes.environment import prepare_environment
 from hat_ros.nodes.params import declare_parameters
-from hat_ros.nodes.wire import Wire, message_class, stamp_of
+from hat_ros.nodes.wire import Wire, message_class
 
 OK, WARN, ERROR = 0, 1, 2
 _ACK_TIMEOUT_S = 10.0
@@ -156,27 +156,34 @@ class HatNode(LifecycleNode):
 
     # ------------------------------------------------------------ readiness
 
-    def is_matched(self) -> bool:
-        """Whether every endpoint knows its counterparts, so that nothing sent from now on is lost."""
-        return all(self._writers.values()) and all(self._has_readers(topic) for topic in self._outputs)
+    def unmatched(self) -> list[str]:
+        """Endpoints that do not know their counterparts yet; with none, nothing sent from now on is lost."""
+        silent = [f"a publisher of {topic}" for topic, writers in self._writers.items() if not writers]
+        return silent + [reader for topic in self._outputs for reader in self._missing_readers(topic)]
 
-    def _has_readers(self, topic: str) -> bool:
+    def _missing_readers(self, topic: str) -> list[str]:
         publisher, names = self._outputs[topic]
         if not names:
-            return True
-        mine = qos.profile_of(topic, self.settings.live)
+            return []
+        latched = qos.is_latched(topic)
         found = [
-            info
+            info.node_name
             for info in self.get_subscriptions_info_by_topic(topic)
-            if qos_check_compatible(mine, info.qos_profile)[0] != QoSCompatibility.ERROR
+            # A reader that asks for latched messages where there are none is never matched.
+            if latched or info.qos_profile.durability != DurabilityPolicy.TRANSIENT_LOCAL
         ]
-        return set(names) <= {info.node_name for info in found} and publisher.get_subscription_count() >= len(found)
+        missing = [f"{name} on {topic}" for name in names if name not in found]
+        # Discovered is not yet matched: only a matched reader gets what is sent next.
+        return missing or ([f"readers of {topic}"] if publisher.get_subscription_count() < len(found) else [])
 
     def _announce(self) -> None:
-        if self.active and not self._announced and self.is_matched():
+        if not self.active or self._announced:
+            return
+        unmatched = self.unmatched()
+        if not unmatched:
             self._announced = True
             self._ready.publish(self.wire.header(time.time_ns(), self.NAME))
-            self.report(OK, "ready")
+        self.report(OK, "ready" if not unmatched else f"waiting for {', '.join(unmatched)}")
 
     # ------------------------------------------------------------ diagnostics, end
 
@@ -198,8 +205,8 @@ class HatNode(LifecycleNode):
         stuck = [topic for topic in self._outputs if not self._acknowledged(topic)]
         if stuck:
             self.fail(RunError(f"not acknowledged by all readers at the end of the stream: {', '.join(stuck)}"))
-        self.report(OK, f"end of stream at {stamp_of(message)}")
-        self.finished = self.settings.exit_at_end
+        self.report(OK, "end of stream")
+        self.finished = self.finished or self.settings.exit_at_end
 
     def _acknowledged(self, topic: str) -> bool:
         return self._outputs[topic][0].wait_for_all_acked(Duration(seconds=_ACK_TIMEOUT_S))

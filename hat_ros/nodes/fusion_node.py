@@ -38,7 +38,7 @@ class FusionNode(StageNode):
             *((topics.TF,) if find_spec("tf2_msgs") else ()),
         )
         self._status = self.output(topics.STATUS, "segmentation", *readers)
-        self._publishers = {topic: self.output(topic) for topic in names}
+        self._emit = {topic: self.output(topic) for topic in names}
 
     def joined(self) -> tuple[str, ...]:
         """The image is needed by refinement alone."""
@@ -66,12 +66,12 @@ class FusionNode(StageNode):
 
     def _publish_pose(self, frame_id: str, estimate: Estimate) -> None:
         stamp_ns, row, make = estimate.stamp_ns, estimate.pose_row, self.wire
-        self._publishers[topics.TARGET_POSE].publish(make.pose(stamp_ns, frame_id, row))
+        self._emit[topics.TARGET_POSE].publish(make.pose(stamp_ns, frame_id, row))
         message = make.pose_with_covariance(stamp_ns, frame_id, row, estimate.covariance)
-        self._publishers[topics.TARGET_POSE_WITH_COVARIANCE].publish(message)
-        if topics.TF in self._publishers:
+        self._emit[topics.TARGET_POSE_WITH_COVARIANCE].publish(message)
+        if topics.TF in self._emit:
             transform = make.transform(stamp_ns, frame_id, self._target_frame_id, row)
-            self._publishers[topics.TF].publish(wire.message_class(topics.TYPES[topics.TF])(transforms=[transform]))
+            self._emit[topics.TF].publish(wire.message_class(topics.TYPES[topics.TF])(transforms=[transform]))
 
     def _publish_alignment(self, stamp_ns: int, estimate: Estimate) -> None:
         alignment = estimate.alignment
@@ -80,9 +80,9 @@ class FusionNode(StageNode):
             slam_frame_id = f"slam_{alignment.epoch}"
             row = np.concatenate([alignment.translation_m, alignment.quat_xyzw])
             message = self.wire.alignment(stamp_ns, slam_frame_id, alignment)
-            self._publishers[topics.ALIGNMENT].publish(message)
+            self._emit[topics.ALIGNMENT].publish(message)
             transform = self.wire.transform(stamp_ns, self._target_frame_id, slam_frame_id, row)
-            self._publishers[topics.ALIGNMENT_TRANSFORM].publish(transform)
+            self._emit[topics.ALIGNMENT_TRANSFORM].publish(transform)
         self._version = version
 
     @property

@@ -103,7 +103,7 @@ def declare_parameters(node: Node, extra: dict[str, tuple[Any, str]] | None = No
 
 def _take_overrides(node: Node) -> dict[str, Any]:
     """Values given on the command line or in a parameter file; undeclared again, to be declared with descriptions."""
-    own = [name for name in node.list_parameters([], 0).result.names if not _is_ros_own(name)]
+    own = [name for name in node.list_parameters([], 0).names if not _is_ros_own(name)]
     given = {name: node.get_parameter(name).value for name in own}
     for name in own:
         node.undeclare_parameter(name)

@@ -26,6 +26,7 @@ class PlayerNode(base.HatNode):
         n_status: statuses received.
         last_status: the newest of them.
         sent_s: stamp -> monotonic time at which the frame was sent.
+        said: node -> text of its last diagnostics.
         latency_s: from sending a frame to its status, in order of the statuses.
     """
 
@@ -58,6 +59,7 @@ class PlayerNode(base.HatNode):
         self.last_status: wire.Status | None = None
         self.sent_s: dict[int, float] = {}
         self.latency_s: list[float] = []
+        self.said: dict[str, str] = {}
         self._is_open = False
         self.progress_s = time.monotonic()
         self._start: tuple[int, float] | None = None
@@ -109,17 +111,20 @@ class PlayerNode(base.HatNode):
         self._feed()
 
     def _on_diagnostics(self, message: Any) -> None:
-        """Frames rejected after the last status are known from here alone."""
+        """Frames rejected after the last status are known from here alone; and why a node is not ready."""
         for status in message.status:
+            self.said[status.name.removeprefix("hat: ")] = status.message
             if status.name == "hat: segmentation":
                 counts = {item.key: item.value for item in status.values}
                 self.dropped = max(self.dropped, int(counts.get("dropped", 0)))
 
     def _feed(self) -> None:
         if not self._is_open:
-            self._is_open = self._ready_nodes >= set(self.settings.extra["wait_for"]) and self.is_matched()
+            self._is_open = self._ready_nodes >= set(self.settings.extra["wait_for"]) and not self.unmatched()
             if not self._is_open:
-                self._check_time(self.settings.config.graph.startup_timeout_s, "the graph was not ready")
+                absent = [name for name in self.settings.extra["wait_for"] if name not in self._ready_nodes]
+                why = "; ".join(f"{name}: {self.said.get(name, 'silent')}" for name in absent) or self.unmatched()
+                self._check_time(self.settings.config.graph.startup_timeout_s, f"the graph was not ready ({why})")
                 return
         while self._next is not None and self._may_send(self._next):
             self._send(self._next)

@@ -122,7 +122,7 @@ class SegmentationNode(base.HatNode):
 
     def _pump(self) -> None:
         if not self._is_open:
-            self._is_open = self._ready_nodes >= _STAGES and self.is_matched()
+            self._is_open = self._ready_nodes >= _STAGES and not self.unmatched()
         while self._is_open and self._queue and self._camera is not None and self.admission.has_credit:
             stamp_ns, message = self._queue[0]
             if self._masks is not None and stamp_ns not in self._masks:
