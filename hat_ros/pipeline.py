@@ -30,7 +30,7 @@ from hat_ros.tracker import Step
 from hat_ros.types import Frame
 
 STAGE_NAMES = ("segmentation", "hypotheses", "motion", "selector", "fusion")
-MEASURED = ("latency_ms", "decode_ms", *(f"{name}_ms" for name in STAGE_NAMES), "mask_iou")
+MEASURED = ("latency_ms", "cpu_ms", "decode_ms", *(f"{name}_ms" for name in STAGE_NAMES), "mask_iou")
 # First frames left out of throughput and latency: compiled code is loaded and caches are filled there.
 WARMUP_FRAMES = 10
 
@@ -43,6 +43,7 @@ class Processed:
         frame: the frame as recorded, given mask included.
         step: what the stages said.
         latency_ms: wall time of the step.
+        cpu_ms: processor time of the step, all threads together.
         decode_ms: wall time of reading and decoding the frame before it.
         stage_ms: wall time by stage.
         mask_iou: overlap of the detected and the recorded silhouette, NaN when none was recorded.
@@ -51,13 +52,14 @@ class Processed:
     frame: Frame
     step: Step
     latency_ms: float
+    cpu_ms: float
     decode_ms: float
     stage_ms: dict[str, float]
     mask_iou: float
 
     def measured(self) -> tuple[float, ...]:
         """The values of :data:`MEASURED`, in order."""
-        return (self.latency_ms, self.decode_ms, *self.stage_ms.values(), self.mask_iou)
+        return (self.latency_ms, self.cpu_ms, self.decode_ms, *self.stage_ms.values(), self.mask_iou)
 
 
 class StageClock:
@@ -128,13 +130,13 @@ class Pipeline:
 
     def _process(self, frame: Frame, decode_ms: float) -> Processed:
         seen = frame if self._masks_given else replace(frame, given_mask=None)
-        start = time.perf_counter()
+        start, start_cpu = time.perf_counter(), time.process_time()
         step = self._method.step(seen)
-        latency_ms = 1e3 * (time.perf_counter() - start)
+        latency_ms, cpu_ms = 1e3 * (time.perf_counter() - start), 1e3 * (time.process_time() - start_cpu)
         iou = float("nan")
         if frame.given_mask is not None and (silhouette := frame.given_mask == 255).any():
             iou = mask_iou(None if step.detection is None else step.detection.mask, silhouette)
-        return Processed(frame, step, latency_ms, decode_ms, self._clock.take(), iou)
+        return Processed(frame, step, latency_ms, cpu_ms, decode_ms, self._clock.take(), iou)
 
 
 @dataclass(frozen=True)
@@ -216,6 +218,7 @@ def latency_summary(rows: list[tuple[float, ...]]) -> dict[str, float]:
         "latency_ms_p50": float(np.percentile(column["latency_ms"], 50)),
         "latency_ms_p99": float(np.percentile(column["latency_ms"], 99)),
         "latency_ms_max": float(column["latency_ms"].max()),
+        "cpu_ms_mean": float(column["cpu_ms"].mean()),
         "decode_ms_mean": float(column["decode_ms"].mean()),
         **{f"{name}_ms_mean": float(column[f"{name}_ms"].mean()) for name in STAGE_NAMES},
     }

@@ -105,14 +105,21 @@ def test_bad_input_is_exit_code_2_and_one_sentence(arguments, sentence, bag, set
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [[], ["fly"], ["track"], ["track", "x", "--out", "y", "--mode", "magic"],
-     ["track", "x", "--out", "y", "--limit", "0"], ["bench", "x", "--out", "y", "--modes", "hat,magic"], ["track", "x", "--out", "y", "--start", "-1"]],
-)  # fmt: skip
-def test_wrong_usage_is_exit_code_2(arguments, capsys):
+WRONG_USAGE = (
+    "",
+    "fly",
+    "track",
+    "track x --out y --mode magic",
+    "track x --out y --limit 0",
+    "track x --out y --start -1",
+    "bench x --out y --modes hat,magic",
+)
+
+
+@pytest.mark.parametrize("text", WRONG_USAGE)
+def test_wrong_usage_is_exit_code_2(text, capsys):
     with pytest.raises(SystemExit) as stop:
-        main(arguments)
+        main(text.split())
     assert stop.value.code == 2
     assert "usage: hat" in capsys.readouterr().err
 

@@ -128,8 +128,6 @@ def _add_bench(commands: Commands) -> None:
 
 
 def _bench(arguments: argparse.Namespace) -> int:
-    from rich.console import Console
-
     from hat_ros.cli.console import campaign_progress
     from hat_ros.evaluation import bench
     from hat_ros.evaluation.campaign import run_campaign
@@ -149,10 +147,9 @@ def _bench(arguments: argparse.Namespace) -> int:
     table, stages = bench.bench_table(outcomes), bench.stage_table(outcomes)
     table.write(out, "table")
     stages.write(out, "stages")
-    console = Console(width=max(240, Console().width))
-    console.print(table.rich())
+    print(table.text())
     if arguments.stages:
-        console.print(stages.rich())
+        print(stages.text())
     failures = bench.failures(outcomes)
     for line in failures:
         print(f"failed: {line}", file=sys.stderr)

@@ -37,10 +37,12 @@ _FIGURES = (
     Column("fps", "fps", ".1f"),
     Column("latency_ms_p50", "p50 ms", ".1f"),
     Column("latency_ms_p99", "p99 ms", ".1f"),
+    Column("cpu_ms_mean", "cpu ms", ".1f"),
     Column("peak_memory_mib", "MiB", ".0f"),
 )
 _STAGES = (
     Column("fps", "fps", ".1f"),
+    Column("cpu_ms_mean", "cpu ms", ".2f"),
     Column("decode_ms_mean", "decode ms", ".2f"),
     Column("segmentation_ms_mean", "segmentation ms", ".2f"),
     Column("hypotheses_ms_mean", "hypotheses ms", ".2f"),

@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table as RichTable
-
 
 @dataclass(frozen=True)
 class Column:
@@ -45,15 +43,6 @@ class Table:
     title: str
     columns: Sequence[Column]
     rows: Sequence[dict[str, Any]]
-
-    def rich(self) -> RichTable:
-        """For the terminal."""
-        table = RichTable(title=self.title)
-        for column in self.columns:
-            table.add_column(column.title, justify="right" if column.form else "left", no_wrap=True)
-        for row in self.rows:
-            table.add_row(*(column.text(row) for column in self.columns))
-        return table
 
     def text(self) -> str:
         """Aligned plain text."""
