@@ -2,19 +2,23 @@
 
 * ``independent``: hypotheses at every frame; the best appearance is the output. No memory.
 * ``tracking``: refine the previous pose on each image; the best appearance only to (re-)start. No decoder, no fusion.
-* ``offline``: HAT's observations, then a backtrace and one joint optimisation of all frames. Not causal: a reference.
+* ``offline``: HAT's observations, then a backtrace and one joint optimisation of all frames, and dense refinement where
+  the configuration refines. Not causal: a reference.
 
 Each offers what :class:`~hat_ros.tracker.HatTracker` offers, so the pipeline runs them all alike.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 
+from hat_ros import lie
 from hat_ros.config import HatConfig
+from hat_ros.core.offline import solve_offline
 from hat_ros.core.refiner import Refiner
 from hat_ros.errors import UsageError
 from hat_ros.hypotheses.stage import HypothesisStage
@@ -22,7 +26,7 @@ from hat_ros.refinement import create_refiner
 from hat_ros.segmentation.stage import SegmentationStage
 from hat_ros.target import Target
 from hat_ros.tracker import HatTracker, Step
-from hat_ros.types import Candidates, Detection, Estimate, Frame, Motion, Refined, Selection, TrackState
+from hat_ros.types import Camera, Candidates, Detection, Estimate, Frame, Motion, Refined, Selection, TrackState
 
 MODES = ("hat", "independent", "tracking", "offline")
 
@@ -55,7 +59,7 @@ def create_method(mode: str, config: HatConfig, target: Target) -> Method:
         UsageError: unknown mode.
         ConfigError: the configuration names an unknown backend.
     """
-    methods = {"hat": Hat, "independent": Independent, "tracking": Tracking}
+    methods = {"hat": Hat, "independent": Independent, "tracking": Tracking, "offline": Offline}
     if mode not in methods:
         raise UsageError(f"mode '{mode}' is unknown, choose one of {', '.join(MODES)}")
     return methods[mode](config, target)
@@ -159,6 +163,80 @@ class _LastPose:
         refined = self._refiner.refine(frame, detection, self._T_cam_target)
         self._T_cam_target = None if refined is None else refined.T_cam_target
         return refined
+
+
+class Offline:
+    """What hindsight makes of the observations of HAT (paper, "Causal and Offline Performance Comparison")."""
+
+    causal = False
+
+    def __init__(self, config: HatConfig, target: Target) -> None:
+        self._config = config
+        self._hat = Hat(config, target)
+        self._refiner = create_refiner(config, target)
+        self._steps: list[Step] = []
+        self._images: list[_StoredImage] = []
+        self.stages = self._hat.stages
+
+    def step(self, frame: Frame) -> Step:
+        """Observe; the estimate in the returned step is the causal one."""
+        step = self._hat.step(frame)
+        self._steps.append(replace(step, detection=None))
+        if self._refiner is not None:
+            self._images.append(_StoredImage.of(frame, step.detection))
+        return step
+
+    def finish(self) -> list[Estimate]:
+        """Decode, align, optimise jointly; refine on the images."""
+        steps = self._steps
+        if not steps:
+            return []
+        result = solve_offline([step.candidates for step in steps], [step.motion for step in steps], self._config)
+        rows = lie.row_from_matrix(np.where(np.isfinite(result.T_cam_target), result.T_cam_target, np.eye(4)))
+        rows[~np.isfinite(result.T_cam_target).all(axis=(1, 2))] = np.nan
+        estimates = []
+        for index, step in enumerate(steps):
+            row, covariance = self._refined(index, rows[index])
+            state = TrackState.TRACKING if np.isfinite(row).all() else TrackState.LOST
+            chosen = int(result.chosen[index])
+            estimates.append(
+                replace(step.estimate, state=state, pose_row=row, covariance=covariance, anchor=chosen, gap_frames=0)
+            )
+        return estimates
+
+    def _refined(self, index: int, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if self._refiner is None or not np.isfinite(row).all():
+            return row, _NO_COVARIANCE
+        frame, detection = self._images[index].load()
+        refined = self._refiner.refine(frame, detection, lie.matrix_from_row(row))
+        if refined is None or refined.support < self._config.refinement.min_support:
+            return row, _NO_COVARIANCE
+        return refined.pose_row, refined.covariance
+
+
+@dataclass(frozen=True)
+class _StoredImage:
+    """A frame and its detection, compressed without loss."""
+
+    stamp_ns: int
+    camera: Camera
+    png: np.ndarray
+    mask_bits: np.ndarray | None
+    silhouette: bool
+
+    @classmethod
+    def of(cls, frame: Frame, detection: Detection | None) -> _StoredImage:
+        png = cv2.imencode(".png", frame.rgb, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+        bits = None if detection is None else np.packbits(detection.mask)
+        return cls(frame.stamp_ns, frame.camera, png, bits, detection is not None and detection.silhouette)
+
+    def load(self) -> tuple[Frame, Detection | None]:
+        frame = Frame(self.stamp_ns, cv2.imdecode(self.png, cv2.IMREAD_COLOR), self.camera)
+        if self.mask_bits is None:
+            return frame, None
+        shape = (self.camera.height, self.camera.width)
+        mask = np.unpackbits(self.mask_bits, count=shape[0] * shape[1]).reshape(shape).astype(bool)
+        return frame, Detection(mask, self.silhouette)
 
 
 def _best_appearance(frame: Frame, candidates: Candidates) -> Estimate:

@@ -56,7 +56,7 @@ def error_figure(log: RunLog) -> Figure:
         for moment in t[log.reset]:
             axis.axvline(moment, color="#b00020", linestyle="--", linewidth=1)
     anchors = anchor_errors_deg(log)
-    best = metrics.best_of_k_deg(log.candidates, log.T_true)
+    best = metrics.best_of_k_deg([group.pose_rows for group in log.candidates], log.T_true)
     at = log.keyframe & np.isfinite(best)
     axes[0].plot(t[at], np.maximum(best[at], 0.05), "x", color="#888888", markersize=4, label="best candidate")
     axes[0].plot(t, np.maximum(anchors, 0.05), "o", color="#e07b00", markersize=3.5, label="anchor chosen")
@@ -71,7 +71,7 @@ def anchor_errors_deg(log: RunLog) -> metrics.Float:
     out = np.full(len(log), np.nan)
     for i in np.flatnonzero((log.anchor >= 0) & log.has_truth):
         if log.anchor[i] < len(log.candidates[i]):
-            R = lie.matrix_from_row(log.candidates[i][log.anchor[i]])[:3, :3]
+            R = lie.matrix_from_row(log.candidates[i].pose_rows[log.anchor[i]])[:3, :3]
             out[i] = np.degrees(lie.angle_between(R, log.T_true[i, :3, :3]))
     return out
 

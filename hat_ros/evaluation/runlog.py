@@ -34,7 +34,7 @@ class RunLog:
         slam_epoch: (N,) epoch of the motion.
         gap_frames: (N,) frames since the last measurement.
         dropped_total: frames that were not admitted (duplicate, backward or malformed stamps; live drops).
-        candidates: N arrays (K_i, 7), best appearance first.
+        candidates: N sets of hypotheses, empty between keyframes.
         motion_valid: (N,) a motion was known.
         motion_rows: (N, 7) ``T_slam_cam``.
         truth_rows: (N, 7) true ``T_cam_target``.
@@ -52,7 +52,7 @@ class RunLog:
     slam_epoch: Int
     gap_frames: Int
     dropped_total: int
-    candidates: tuple[Float, ...]
+    candidates: tuple[Candidates, ...]
     motion_valid: Bool
     motion_rows: Float
     truth_rows: Float
@@ -86,6 +86,12 @@ class RunLog:
     def reset(self) -> Bool:
         """(N,) the alignment was dropped at this frame, for disagreement or for a new SLAM epoch."""
         return (np.diff(self.alignment_version > 0, prepend=False)) & (self.alignment_version == 0)
+
+    def motion(self, index: int) -> Motion:
+        """What was known of the camera's motion at one frame."""
+        if not self.motion_valid[index]:
+            return Motion.none(int(self.slam_epoch[index]))
+        return Motion(True, int(self.slam_epoch[index]), self.motion_rows[index])
 
     def with_truth(self, truth: Mapping[int, Float]) -> RunLog:
         """The same run beside another truth: exact stamp -> pose row (7,)."""
@@ -121,7 +127,7 @@ class RunLogBuilder:
                 "alignment_version": alignment_version,
                 "slam_epoch": estimate.slam_epoch,
                 "gap_frames": estimate.gap_frames,
-                "candidates": candidates.pose_rows,
+                "candidates": candidates,
                 "motion_valid": motion.valid,
                 "motion_rows": motion.pose_row,
             }

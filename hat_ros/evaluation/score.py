@@ -49,7 +49,7 @@ def score_run(log: RunLog, target: Target | None = None) -> dict[str, Any]:
         "inside_95_share": float(np.mean(inside)) if len(inside) else float("nan"),
         "depth_energy_share": metrics.depth_energy_share(log.T_est, log.T_true),
     }
-    out |= metrics.candidate_oracle([log.candidates[i] for i in keyframes], log.T_true[keyframes])
+    out |= metrics.candidate_oracle([log.candidates[i].pose_rows for i in keyframes], log.T_true[keyframes])
     if target is not None and errors.scored.any():
         distances = metrics.add_s(surface_points(target), log.T_est, log.T_true)
         out["ADD_S_m_mean"] = float(np.nanmean(distances))
