@@ -16,9 +16,6 @@ from hat_ros.render import Rendering
 from hat_ros.target import Target
 from hat_ros.types import Camera
 
-# Hits beyond this are Embree's "no hit" marker (1e37).
-_FAR = np.float32(1e30)
-
 
 class RayCaster:
     """Nearest hits and visibility for bundles of rays against one target, in the target frame."""
@@ -32,15 +29,17 @@ class RayCaster:
         self, origins_m: NDArray[np.floating], directions: NDArray[np.floating]
     ) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
         """Nearest hits: (N, 3), (N, 3) -> face (N,) or -1, ray parameter (N,), barycentric weights (N, 3)."""
-        hits = self._scene.run(
+        hits = self.trace(origins_m, directions)
+        u, v = hits["u"], hits["v"]
+        return hits["primID"], hits["tfar"], np.stack([1.0 - u - v, u, v], axis=-1)
+
+    def trace(self, origins_m: NDArray[np.floating], directions: NDArray[np.floating]) -> dict[str, NDArray]:
+        """Embree's own record of the nearest hits: ``primID`` (-1 = miss), ``tfar``, ``u``, ``v`` of N rays."""
+        return self._scene.run(
             np.ascontiguousarray(origins_m, dtype=np.float32),
             np.ascontiguousarray(directions, dtype=np.float32),
             output=True,
         )
-        face = hits["primID"]
-        face[hits["tfar"] > _FAR] = -1
-        u, v = hits["u"], hits["v"]
-        return face, hits["tfar"], np.stack([1.0 - u - v, u, v], axis=-1)
 
     def occluded(self, origins_m: NDArray[np.floating], directions: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Whether anything lies on each ray: (N, 3), (N, 3) -> (N,)."""
@@ -61,6 +60,7 @@ class EmbreeRenderer:
         corners = target.vertices_m[target.faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         self.face_normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        self._face_normals32 = self.face_normals.astype(np.float32)
         try:
             self._hull_m = target.vertices_m[ConvexHull(target.vertices_m).vertices]
         except QhullError:  # a flat model
@@ -77,21 +77,30 @@ class EmbreeRenderer:
         if x0 >= x1 or y0 >= y1:
             return Rendering(depth, normal, face_id, rgb)
 
-        directions_cam = pixel_rays(camera, np.arange(x0, x1), np.arange(y0, y1)).reshape(-1, 3)
         R, t = T_cam_target[:3, :3], T_cam_target[:3, 3]
-        directions = directions_cam @ R  # rows times R = R^T applied to each
-        origins = np.broadcast_to(-t @ R, directions.shape)
-        face, z, barycentric = self.caster.cast(origins, directions)
+        # Rays in the target frame are affine in (u, v): no per-pixel matrix product.
+        to_ray = R.T @ np.linalg.inv(camera.K)
+        across = np.arange(x0, x1)[:, None] * to_ray[:, 0]
+        down = np.arange(y0, y1)[:, None] * to_ray[:, 1] + to_ray[:, 2]
+        directions = np.add(down[:, None], across[None], dtype=np.float32, casting="same_kind").reshape(-1, 3)
+        origins = np.empty_like(directions)
+        origins[:] = -t @ R
+        hits = self.caster.trace(origins, directions)
+        face = hits["primID"]
         hit = np.flatnonzero(face >= 0)
-        rows, cols = hit // (x1 - x0) + y0, hit % (x1 - x0) + x0
+        rows, cols = np.divmod(hit, x1 - x0)
+        at = (rows + y0) * camera.width + (cols + x0)
         face = face[hit]
-        n = self.face_normals[face] @ R.T
-        n[np.einsum("nk,nk->n", n, directions_cam[hit]) > 0] *= -1.0
-        depth[rows, cols] = z[hit]
-        normal[rows, cols] = n
-        face_id[rows, cols] = face
+        n = self._face_normals32[face]
+        away = np.einsum("nk,nk->n", n, directions[hit]) > 0
+        n[away] *= np.float32(-1)
+        depth.reshape(-1)[at] = hits["tfar"][hit]
+        normal.reshape(-1, 3)[at] = n @ R.T.astype(np.float32)
+        face_id.reshape(-1)[at] = face
         if color:
-            rgb[rows, cols] = self._target.surface.sample(face, barycentric[hit], self._target.face_rgb)
+            u, v = hits["u"][hit], hits["v"][hit]
+            barycentric = np.stack([1.0 - u - v, u, v], axis=-1)
+            rgb.reshape(-1, 3)[at] = self._target.surface.sample(face, barycentric, self._target.face_rgb)
         return Rendering(depth, normal, face_id, rgb)
 
     def pixel_bounds(self, T_cam_target: NDArray[np.float64], camera: Camera) -> tuple[int, int, int, int]:
