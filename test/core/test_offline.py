@@ -1,0 +1,136 @@
+"""The offline reference: the best path of all, the joint optimum of all, and better than causal."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+import scipy.optimize
+from temporal_scene import make_scene, preset, rotation_error_deg
+
+from hat_ros import lie
+from hat_ros.config import FusionConfig, SelectorConfig
+from hat_ros.core.offline import backtrace, solve_offline
+from hat_ros.core.pose_graph import PoseGraph
+from hat_ros.core.selector import motion_penalty, scaled_score
+from hat_ros.temporal import run_temporal
+from hat_ros.types import Candidates, Motion
+
+
+def _recorded(scene, drop=False):
+    o = scene.observations
+    return [o.candidates(i, drop) for i in range(len(o))], [o.motion(i) for i in range(len(o))]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_path_is_the_best_of_all_paths(seed):
+    config = SelectorConfig()
+    scene = make_scene(20, k=3, seed=seed, noise_deg=20, rate_deg=6)
+    candidates, motions = _recorded(scene)
+    keys = [i for i, group in enumerate(candidates) if len(group)]
+    every = np.arange(3)
+
+    def total(path):
+        score = sum(scaled_score(candidates[i], config)[k] for i, k in zip(keys, path, strict=True))
+        for (i, a), (j, b) in zip(zip(keys, path, strict=True), list(zip(keys, path, strict=True))[1:], strict=False):
+            score -= motion_penalty(candidates[i], every, motions[i], candidates[j], every, motions[j], config)[b, a]
+        return score
+
+    best = max(product(range(3), repeat=len(keys)), key=total)
+    assert backtrace(candidates, motions, config)[keys].tolist() == list(best)
+
+
+def test_the_gate_is_one_verdict_over_the_whole_sequence():
+    scene = make_scene(60, k=3, rival_score=0.3)
+    candidates, motions = _recorded(scene)
+    keys = np.flatnonzero(scene.observations.key)
+    # Nobody supports anybody: the median count is one, so every keyframe takes its best appearance.
+    chosen = backtrace(candidates, motions, SelectorConfig(running_gate=True, gate_neighbourhood_deg=0.001))
+    np.testing.assert_array_equal(chosen[keys], np.argmax(scene.observations.scores[keys], axis=1))
+
+
+def test_keyframes_without_survivors_are_passed_over():
+    scene = make_scene(40, k=3)
+    candidates, motions = _recorded(scene)
+    candidates[12] = Candidates(candidates[12].pose_rows, np.full(3, -np.inf))
+    chosen = backtrace(candidates, motions, SelectorConfig())
+    assert chosen[12] == -1
+    assert (chosen[[0, 4, 8, 16, 20]] >= 0).all()
+    assert (backtrace([Candidates.none()] * 5, [Motion.none()] * 5, SelectorConfig()) == -1).all()
+
+
+@pytest.mark.parametrize("name", ["mega_hat", "pico_hat", "mega_hat_spark"])
+def test_hindsight_is_no_worse_than_causal(name):
+    config, causal_deg, offline_deg = preset(name), [], []
+    for seed in range(3):
+        scene = make_scene(160, seed=seed, noise_deg=4)
+        result = run_temporal(scene.observations, config)
+        offline = solve_offline(*_recorded(scene, config.hypotheses.guard), config)
+        causal_deg.append(rotation_error_deg(result.T_cam_target, scene.T_cam_target).mean())
+        offline_deg.append(rotation_error_deg(offline.T_cam_target, scene.T_cam_target).mean())
+        assert lie.is_rigid(offline.T_cam_target, 1e-9).all()
+    assert np.mean(offline_deg) <= np.mean(causal_deg)
+
+
+def test_frames_without_slam_or_anchor_hold_their_neighbour():
+    scene = make_scene(60)
+    candidates, motions = _recorded(scene)
+    for i in (1, 2, 3, 30, 31):
+        motions[i] = Motion.none()
+    T = solve_offline(candidates, motions, preset()).T_cam_target
+    np.testing.assert_array_equal(T[1:4], T[[0, 0, 0]])
+    np.testing.assert_array_equal(T[30:32], T[[29, 29]])
+    empty = solve_offline([Candidates.none()] * 3, motions[:3], preset())
+    assert np.isnan(empty.T_cam_target).all()
+
+
+class TestPoseGraph:
+    @staticmethod
+    def _graph(config, seed=0, n=6):
+        rng = np.random.default_rng(seed)
+        graph, terms = PoseGraph(n, config, 1.0), {"anchors": [], "steps": []}
+        poses = lie.transform(lie.so3_exp(0.3 * rng.normal(size=(n, 3))), rng.normal(size=(n, 3)) + [0, 0, 6])
+        for i in range(n):
+            graph.add_pose(i, poses[i])
+            if i % 2 == 0:
+                anchor = lie.transform(lie.so3_exp(0.1 * rng.normal(size=3)) @ poses[i, :3, :3], poses[i, :3, 3] + 0.1)
+                graph.add_anchor(i, anchor, 0.8)
+                terms["anchors"].append((i, anchor, 0.8))
+            if i:
+                step = poses[i] @ lie.inverse(poses[i - 1])
+                step[:3, :3] = lie.so3_exp(0.05 * rng.normal(size=3)) @ step[:3, :3]
+                graph.add_step(i, step)
+                terms["steps"].append((i, step))
+        return graph, terms, poses
+
+    @pytest.mark.parametrize("loss", ["huber", "linear"])
+    @pytest.mark.parametrize("seed", range(3))
+    def test_it_finds_the_joint_optimum_that_scipy_finds(self, loss, seed):
+        config = FusionConfig(relative_weight=0.5, loss=loss, huber_delta_m=0.05)
+        graph, terms, poses = self._graph(config, seed)
+        ours = graph.solve()
+
+        def residuals(x, base):
+            X = x.reshape(-1, 6)
+            T = lie.transform(lie.so3_exp(X[:, :3]) @ base[:, :3, :3], base[:, :3, 3] + X[:, 3:])
+            out = []
+            for i, M, g in terms["anchors"]:
+                out += [g * lie.so3_log(M[:3, :3] @ T[i, :3, :3].T), g * (M[:3, 3] - T[i, :3, 3])]
+            for i, step in terms["steps"]:
+                E = step @ T[i - 1] @ lie.inverse(T[i])
+                out += [0.5 * lie.so3_log(E[:3, :3]), 0.5 * E[:3, 3]]
+            return np.concatenate(out)
+
+        kind = {} if loss == "linear" else {"loss": "huber", "f_scale": 0.05}
+        found = scipy.optimize.least_squares(residuals, np.zeros(36), args=(ours,), xtol=1e-15, ftol=1e-15, **kind)
+        np.testing.assert_allclose(found.x, 0.0, atol=2e-4)
+        start = scipy.optimize.least_squares(residuals, np.zeros(36), args=(poses,), xtol=1e-15, ftol=1e-15, **kind)
+        here = scipy.optimize.least_squares(residuals, np.zeros(36), args=(ours,), max_nfev=1, **kind)
+        assert here.cost <= start.cost * (1 + 1e-6)
+
+    def test_poses_without_any_term_stay_where_they_start(self):
+        graph = PoseGraph(3, FusionConfig(), 1.0)
+        T = lie.transform(np.eye(3), np.array([0.0, 0, 5]))
+        graph.add_pose(1, T)
+        out = graph.solve()
+        np.testing.assert_allclose(out[1], T, atol=1e-9)
+        assert np.isnan(out[[0, 2]]).all()

@@ -1,0 +1,193 @@
+"""Fusion with an eye on the image, with a refiner whose image is a known set of basins."""
+
+import numpy as np
+import pytest
+from temporal_scene import HALF_TURN, make_scene, preset, rotation_error_deg
+
+from hat_ros import lie
+from hat_ros.core.fusion import FusionStage
+from hat_ros.core.refined import quality
+from hat_ros.types import Camera, Candidates, Frame, Motion, Refined, Selection, TrackState
+
+COVARIANCE = np.diag([1e-6] * 6)
+
+
+class BasinRefiner:
+    """Snaps to the nearest of the frame's basins within 15 degrees; each basin has its own image evidence."""
+
+    def __init__(self, scene, evidence=None):
+        self._scene = scene
+        self._evidence = evidence or (lambda index: {"true": (0.97, 0.97), "flipped": (0.8, 0.8)})
+        self.calls = 0
+
+    def refine(self, frame, detection, T_cam_target):
+        self.calls += 1
+        index = frame.stamp_ns // 10**8 - 1
+        truth = self._scene.T_cam_target[index]
+        for name, turn in (("true", np.eye(3)), ("flipped", HALF_TURN)):
+            basin = lie.transform(truth[:3, :3] @ turn, truth[:3, 3])
+            near = rotation_error_deg(basin, T_cam_target) < 15
+            evidence = self._evidence(index).get(name)
+            if near and evidence is not None and np.linalg.norm(basin[:3, 3] - T_cam_target[:3, 3]) < 1.0:
+                return Refined(lie.row_from_matrix(basin), COVARIANCE, *evidence)
+        return None
+
+    def reset(self):
+        self.calls = 0
+
+
+def _selection(T_cam_target):
+    candidates = Candidates.from_matrices(T_cam_target[None], np.zeros(1))
+    return Selection(candidates, np.zeros(1), np.zeros(1), 0)
+
+
+def _flipped(T):
+    return lie.transform(T[:3, :3] @ HALF_TURN, T[:3, 3])
+
+
+def _run(stage, scene, frames, anchor=lambda i, T: T, moving=True):
+    """``anchor(i, truth)`` gives the anchor at keyframes, or None."""
+    out = []
+    for i in frames:
+        T = anchor(i, scene.T_cam_target[i]) if scene.observations.key[i] else None
+        frame = Frame((i + 1) * 10**8, np.zeros((1, 1, 3), np.uint8), Camera(np.eye(3), 1, 1))
+        motion = scene.observations.motion(i) if moving else Motion.none()
+        out.append(stage.update(frame, None, motion, Selection.none() if T is None else _selection(T)))
+    return out
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_scene(120, gap=8)
+
+
+def _errors(estimates, scene, frames):
+    return np.array(
+        [rotation_error_deg(e.T_cam_target, scene.T_cam_target[i]) for e, i in zip(estimates, frames, strict=True)]
+    )
+
+
+def _stage(scene, evidence=None, **fusion):
+    config = preset("default", fusion={"coast_limit_frames": 10, **fusion})
+    return FusionStage(config, BasinRefiner(scene, evidence))
+
+
+def _noisy(i, T):
+    rng = np.random.default_rng(i)
+    return lie.transform(lie.so3_exp(0.05 * rng.normal(size=3)) @ T[:3, :3], T[:3, 3] + 0.1 * rng.normal(size=3))
+
+
+def test_every_frame_is_measured_from_the_first_anchor_on(scene):
+    estimates = _run(_stage(scene), scene, range(120), _noisy)
+    assert {e.state for e in estimates} == {TrackState.TRACKING}
+    assert {e.gap_frames for e in estimates} == {0}
+    np.testing.assert_allclose(_errors(estimates, scene, range(120)), 0, atol=1e-5)
+    np.testing.assert_array_equal(estimates[50].covariance, COVARIANCE)
+
+
+def test_it_needs_no_slam(scene):
+    estimates = _run(_stage(scene), scene, range(120), _noisy, moving=False)
+    assert {e.state for e in estimates} == {TrackState.TRACKING}
+    assert estimates[-1].alignment is None
+
+
+def test_measured_keyframes_are_what_the_alignment_is_fitted_to(scene):
+    estimates = _run(_stage(scene), scene, range(120), _noisy)
+    assert estimates[16].alignment is not None
+    assert estimates[119].alignment.rms < 1e-6
+
+
+def test_one_wrong_anchor_is_outvoted_by_the_image(scene):
+    estimates = _run(_stage(scene), scene, range(120), lambda i, T: _flipped(T) if i == 64 else T)
+    assert (_errors(estimates, scene, range(120)) < 1e-5).all()
+    assert estimates[64].gate_weight < 1
+    assert estimates[-1].n_resets == 0
+
+
+def test_a_wrong_start_is_left_as_soon_as_the_anchors_say_so(scene):
+    """Before the warm-up one anchor is enough, unless the image speaks against it."""
+    estimates = _run(_stage(scene), scene, range(40), lambda i, T: _flipped(T) if i == 0 else T)
+    errors = _errors(estimates, scene, range(40))
+    assert (errors[:8] > 170).all()
+    assert (errors[8:] < 1e-5).all()
+    assert estimates[-1].n_resets == 1
+
+
+def test_a_locked_wrong_basin_is_left_when_the_image_prefers_the_anchor(scene):
+    """Settled in the wrong basin; the rival's lead decides at its first appearance."""
+    estimates = _run(_stage(scene), scene, range(120), lambda i, T: _flipped(T) if i < 56 else T)
+    errors = _errors(estimates, scene, range(120))
+    assert (errors[:56] > 170).all()
+    assert (errors[56:] < 1e-5).all()
+
+
+def test_equal_evidence_leaves_the_decision_to_four_coherent_anchors(scene):
+    def equal(index):
+        return {"true": (0.9, 0.9), "flipped": (0.9, 0.9)}
+
+    estimates = _run(_stage(scene, equal), scene, range(120), lambda i, T: _flipped(T) if i < 56 else T)
+    errors = _errors(estimates, scene, range(120))
+    assert (errors[56:80] > 170).all()
+    assert (errors[80:] < 1e-5).all()
+
+
+def test_a_worse_rival_is_refused_however_coherent(scene):
+    def worse(index):
+        return {"true": (0.9, 0.9), "flipped": (0.7, 0.7)}
+
+    estimates = _run(_stage(scene, worse), scene, range(120), lambda i, T: T if i < 40 else _flipped(T))
+    assert (_errors(estimates, scene, range(120)) < 1e-5).all()
+
+
+def test_unsupported_frames_coast_then_lose_and_a_supported_anchor_starts_again(scene):
+    def dark(index):
+        return {} if 40 <= index < 60 else {"true": (0.9, 0.9)}
+
+    stage = _stage(scene, dark)
+    estimates = _run(stage, scene, range(120), lambda i, T: T if not 40 <= i < 60 else _flipped(T))
+    states = [e.state for e in estimates]
+    assert states[40:50] == [TrackState.COASTING] * 10
+    assert states[50:64] == [TrackState.LOST] * 14
+    assert states[64:] == [TrackState.TRACKING] * 56
+    trace = [np.trace(e.covariance) for e in estimates[40:50]]
+    assert (np.diff(trace) > 0).all()
+
+
+def test_while_coasting_the_pose_follows_the_motion(scene):
+    def dark(index):
+        return {} if 40 <= index < 48 else {"true": (0.9, 0.9)}
+
+    estimates = _run(_stage(scene, dark), scene, range(60))
+    assert (_errors(estimates, scene, range(60)) < 0.1).all()
+
+
+@pytest.mark.parametrize("evidence", [(0.3, 0.9), (0.9, 0.1)], ids=["overlap", "support"])
+def test_weak_evidence_is_no_measurement(scene, evidence):
+    estimates = _run(_stage(scene, lambda index: {"true": evidence}), scene, range(30))
+    assert TrackState.TRACKING not in {e.state for e in estimates}
+
+
+def test_a_box_without_silhouette_is_judged_by_the_contour_alone():
+    refined = Refined(np.zeros(7), COVARIANCE, float("nan"), 0.7)
+    assert quality(refined) == 0.7
+    assert quality(Refined(np.zeros(7), COVARIANCE, 0.9, 0.7)) == pytest.approx(0.8)
+    assert quality(None) == 0.0
+
+
+def test_a_quiet_frame_costs_one_refinement(scene):
+    stage = _stage(scene)
+    _run(stage, scene, range(40))
+    refiner = stage._refiner
+    refiner.calls = 0
+    _run(stage, scene, range(41, 48))
+    assert refiner.calls == 7
+
+
+def test_prefix_and_reset(scene):
+    a = _run(_stage(scene), scene, range(60), _noisy)
+    stage = _stage(scene)
+    b = _run(stage, scene, range(30), _noisy)
+    assert [e.pose_row.tobytes() for e in a[:30]] == [e.pose_row.tobytes() for e in b]
+    stage.reset()
+    c = _run(stage, scene, range(60), _noisy)
+    assert [e.pose_row.tobytes() for e in a] == [e.pose_row.tobytes() for e in c]
