@@ -130,7 +130,9 @@ def _add_bench(commands: Commands) -> None:
 def _bench(arguments: argparse.Namespace) -> int:
     from hat_ros.cli.console import campaign_progress
     from hat_ros.evaluation import bench
+    from hat_ros.evaluation.bench_figure import bench_figure
     from hat_ros.evaluation.campaign import run_campaign
+    from hat_ros.evaluation.figures import image_bytes
 
     jobs = bench.bench_jobs(
         arguments.recordings,
@@ -147,6 +149,8 @@ def _bench(arguments: argparse.Namespace) -> int:
     table, stages = bench.bench_table(outcomes), bench.stage_table(outcomes)
     table.write(out, "table")
     stages.write(out, "stages")
+    for form in ("png", "svg"):
+        (out / f"bench.{form}").write_bytes(image_bytes(bench_figure(table.rows), form))
     print(table.text())
     if arguments.stages:
         print(stages.text())

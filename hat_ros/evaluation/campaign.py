@@ -114,8 +114,7 @@ def run_campaign(
         RunError: the campaign folder cannot be written.
         MissingDependencyError: a scheduler is asked for but ``distributed`` is not installed.
     """
-    for job in jobs:
-        job.fingerprint()
+    work = [(job, out / "runs" / job.name, job.fingerprint()) for job in jobs]
     runs = out / "runs"
     try:
         runs.mkdir(parents=True, exist_ok=True)
@@ -123,16 +122,16 @@ def run_campaign(
         raise RunError(f"cannot create {runs}: {error.strerror}") from None
     execute = _on_this_machine(n_jobs) if scheduler is None else _on_cluster(scheduler)
     outcomes: dict[str, Outcome] = {}
-    for outcome in execute([(job, runs / job.name) for job in jobs]):
+    for outcome in execute(work):
         outcomes[outcome.job.name] = outcome
         if watch is not None:
             watch(outcome)
     return [outcomes[job.name] for job in jobs]
 
 
-def run_job(job: Job, folder: Path) -> Outcome:
-    """Run one job in a process of its own, unless it is done already."""
-    if (figures := _finished(job, folder)) is not None:
+def run_job(job: Job, folder: Path, fingerprint: dict[str, Any]) -> Outcome:
+    """Run one job in a process of its own, unless a finished run with this fingerprint is there."""
+    if (figures := _finished(folder, fingerprint)) is not None:
         return Outcome(job, folder, figures, reused=True)
     environment = os.environ | dict.fromkeys(_ONE_THREAD, "1")
     done = subprocess.run(job.command(folder), capture_output=True, text=True, env=environment)
@@ -143,23 +142,23 @@ def run_job(job: Job, folder: Path) -> Outcome:
     return Outcome(job, folder, json.loads((folder / METRICS_FILE).read_text(encoding="utf-8")))
 
 
-def _finished(job: Job, folder: Path) -> dict[str, Any] | None:
+def _finished(folder: Path, fingerprint: dict[str, Any]) -> dict[str, Any] | None:
     try:
         run = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
         figures = json.loads((folder / METRICS_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return figures if all(run.get(key) == value for key, value in job.fingerprint().items()) else None
+    return figures if all(run.get(key) == value for key, value in fingerprint.items()) else None
 
 
-Work = Sequence[tuple[Job, Path]]
+Work = Sequence[tuple[Job, Path, dict[str, Any]]]
 
 
 def _on_this_machine(n_jobs: int) -> Callable[[Work], Iterator[Outcome]]:
     def execute(work: Work) -> Iterator[Outcome]:
         with ThreadPoolExecutor(n_jobs) as pool:
             try:
-                futures = [pool.submit(run_job, job, folder) for job, folder in work]
+                futures = [pool.submit(run_job, *item) for item in work]
                 for future in as_completed(futures):
                     yield future.result()
             except BaseException:
@@ -186,7 +185,7 @@ def _on_cluster(address: str) -> Callable[[Work], Iterator[Outcome]]:
         except OSError as error:
             raise RunError(f"no Dask scheduler answers at {address} ({error})") from None
         with client:
-            futures = [client.submit(run_job, job, folder, pure=False, retries=1) for job, folder in work]
+            futures = [client.submit(run_job, *item, pure=False, retries=1) for item in work]
             for future in as_completed_there(futures):
                 yield future.result()
 
