@@ -116,6 +116,17 @@ class FeatureSlamConfig:
     """Training-free target-relative motion."""
 
     max_points: int = option(200, "point tracks kept alive", low=16, high=2000)
+    spacing_px: float = option(4.0, "smallest distance between a new point and any other, px", low=1)
+    window_frames: int = option(14, "frames adjusted together, spread over the span", low=8, high=64)
+    window_span_frames: int = option(60, "age at which a frame leaves the window", low=8, high=1000)
+    iterations: int = option(4, "bundle adjustment steps per frame", low=1, high=50)
+    sigma_px: float = option(1.0, "standard deviation of a track: errors persist, so more than its jitter", low=0.01)
+    cutoff_px: float = option(1.0, "scale of the redescending loss on tracks, px", low=0.1)
+    turn_acceleration_deg_s2: float = option(3.0, "standard deviation of the angular acceleration", low=1e-3)
+    move_acceleration_radii_s2: float = option(2.0, "of the linear acceleration, in apparent target radii", low=1e-3)
+    use_prior: bool = option(True, "let healthy priors bring CAD depth and rotation (needs prior.enabled)")
+    surface_sigma: float = option(0.03, "uncertainty of CAD depth, share of the target's bounding radius", low=1e-3)
+    prior_turn_sigma_deg: float = option(0.5, "uncertainty of a fused rotation relative to others", low=0.01)
 
 
 @dataclass(frozen=True)
@@ -144,6 +155,10 @@ class DroidConfig:
     frontend_nms: int = option(1, "edges keep others this far away in the plane of frame pairs", low=0, high=8)
     motion_damping: float = option(0.0, "share of the last motion in the guess of the next pose", low=0, high=1)
     readout_updates: int = option(3, "motion-only updates of the pose of a frame that is no keyframe", low=1, high=32)
+    readout_depths: bool = option(
+        False,
+        "let these updates move the depths of the last two keyframes too; helps where new surface turns into view",
+    )
     as_released: bool = option(
         True, "keep two slips of the released tracker (depth back-substitution, context of the first frame)"
     )

@@ -7,7 +7,6 @@ All poses here map world points into the camera; :mod:`hat_ros.slam.droid` turns
 from __future__ import annotations
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from hat_ros.config import DroidConfig
@@ -92,19 +91,23 @@ class DroidFrontend:
     def read_out(self, stamp_ns: int, features: Tensor) -> Tensor:
         """Pose (7,) of a frame that is no keyframe, from the last two keyframes; leaves no trace."""
         frames, slot = self.keyframes, len(self.keyframes)
-        guess_pose, guess_disparity = frames.poses[slot].clone(), frames.disparities[slot].clone()
+        touched = slice(slot - 2, slot + 1)
+        before = [tensor[touched].clone() for tensor in (frames.poses, frames.disparities, frames.eta)]
         earlier, last = frames.stamps_ns[-2:]
-        fraction = torch.tensor([1.0 + (stamp_ns - last) / (last - earlier)], device=frames.poses.device)
-        before = torch.tensor([slot - 2], device=frames.poses.device)
-        frames.poses[slot] = frames.interpolated(before, before + 1, fraction)[0]
+        fraction = 1.0 + (stamp_ns - last) / (last - earlier)
+        frames.poses[slot] = frames.interpolated(slot - 2, slot - 1, fraction)
         frames.disparities[slot] = 1.0
         frames.put_features(slot, features)
-        graph = FactorGraph(self.model, frames, stored=self.stored, rule=self.rule)
+        graph = FactorGraph(self.model, frames, stored=self.stored, rule=self.rule, inactive_margin=frames.capacity)
         graph.add(np.array([[slot - 1, slot], [slot - 2, slot]]))
+        motion_only = not self.config.readout_depths
+        if not motion_only:
+            graph.borrow(self.graph, slot - 2)
         for _ in range(self.config.readout_updates):
-            graph.update(slot, motion_only=True)
+            graph.update(slot, use_inactive=not motion_only, motion_only=motion_only)
         pose = frames.poses[slot].clone()
-        frames.poses[slot], frames.disparities[slot] = guess_pose, guess_disparity
+        for tensor, values in zip((frames.poses, frames.disparities, frames.eta), before, strict=True):
+            tensor[touched] = values
         return pose
 
     def _append(self, stamp_ns: int, features: Tensor, image_bgr: Tensor) -> None:

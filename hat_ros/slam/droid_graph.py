@@ -33,7 +33,7 @@ MAX_FACTORS = 48
 # Frames further apart than this (units of 8 pixels) are never compared.
 _MAX_DISTANCE = 100.0
 # Retired edges take part in bundle adjustment while both ends are at most this far before the first free pose.
-_INACTIVE_MARGIN = 3
+INACTIVE_MARGIN = 3
 
 
 @dataclass(frozen=True)
@@ -120,6 +120,7 @@ class FactorGraph:
         max_factors: limit of active edges where room is made for new ones.
         stored: keep the correlation volumes instead of forming them at every update.
         rule: variant of the bundle adjustment.
+        inactive_margin: how many frames before the first free pose retired edges may reach.
     """
 
     def __init__(
@@ -130,7 +131,9 @@ class FactorGraph:
         max_factors: int = MAX_FACTORS,
         stored: bool = True,
         rule: BundleRule = PUBLISHED_RULE,
+        inactive_margin: int = INACTIVE_MARGIN,
     ) -> None:
+        self.inactive_margin = inactive_margin
         self.model, self.keyframes = model, keyframes
         self.max_factors, self.stored, self.rule = max_factors, stored, rule
         h, w = keyframes.shape
@@ -205,6 +208,16 @@ class FactorGraph:
         self.hidden, self.target, self.weight = self.hidden[kept], self.target[kept], self.weight[kept]
         self.correlation.select(kept)
 
+    def borrow(self, other: FactorGraph, first_source: int) -> None:
+        """Take the edges of another graph that start at ``first_source`` or later as retired ones of this graph."""
+        self._plan = None
+        active, retired = other.ii >= first_source, other.ii_inactive >= first_source
+        picked, picked_inactive = self._send(np.flatnonzero(active)), self._send(np.flatnonzero(retired))
+        self.ii_inactive = np.concatenate([other.ii[active], other.ii_inactive[retired]])
+        self.jj_inactive = np.concatenate([other.jj[active], other.jj_inactive[retired]])
+        self.target_inactive = torch.cat([other.target[picked], other.target_inactive[picked_inactive]])
+        self.weight_inactive = torch.cat([other.weight[picked], other.weight_inactive[picked_inactive]])
+
     def remove_keyframe(self, index: int) -> None:
         """Forget a keyframe and all its edges; later keyframes move down by one."""
         self._drop_inactive((self.ii_inactive == index) | (self.jj_inactive == index))
@@ -223,7 +236,7 @@ class FactorGraph:
         if not len(self):
             return len(self.keyframes)
         first_free = max(1, int(self.ii.min()) + 1)
-        return max(min(int(self.ii.min()), int(self.jj.min()), first_free - _INACTIVE_MARGIN), 0)
+        return max(min(int(self.ii.min()), int(self.jj.min()), first_free - self.inactive_margin), 0)
 
     def update(
         self,
@@ -271,7 +284,7 @@ class FactorGraph:
             first = max(1, int(self.ii.min()) + 1)
         if self._plan is not None and (self._plan.first, self._plan.use_inactive) == (first, use_inactive):
             return self._plan
-        oldest = first - _INACTIVE_MARGIN
+        oldest = first - self.inactive_margin
         extra = (self.ii_inactive >= oldest) & (self.jj_inactive >= oldest)
         extra &= use_inactive
         ii = np.concatenate([self.ii_inactive[extra], self.ii])

@@ -142,17 +142,20 @@ class Keyframes:
         self.poses[n] = retract(self.poses[n - 1], motion_damping * velocity)
         self.disparities[n] = self.disparities[n - 3 : n - 1].quantile(0.5)
 
-    def interpolated(self, before: Tensor, after: Tensor, fraction: Tensor) -> Tensor:
-        """Poses (m, 7) on the constant-velocity line through keyframes ``before`` (at 0) and ``after`` (at 1).
+    def interpolated(self, before: int | Tensor, after: int | Tensor, fraction: float | Tensor) -> Tensor:
+        """Poses on the constant-velocity line through two keyframes (or (m,) of them each).
 
         Args:
-            before: (m,) keyframe indices.
-            after: (m,) keyframe indices.
-            fraction: (m,) where on the line; outside 0 to 1 it extrapolates.
+            before: keyframe at fraction 0.
+            after: keyframe at fraction 1.
+            fraction: where on the line, shape (m, 1) for several; outside 0 to 1 it extrapolates.
+
+        Returns:
+            (7,) or (m, 7).
         """
         start = self.poses[before]
         velocity = log(compose(self.poses[after], invert(start)))
-        return retract(start, fraction[:, None] * velocity)
+        return retract(start, fraction * velocity)
 
     def _slots(self, like: Tensor) -> Tensor:
         return torch.zeros(self.capacity, *like.shape[1:], dtype=self.dtype, device=like.device)
