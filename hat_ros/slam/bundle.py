@@ -1,0 +1,453 @@
+"""Windowed bundle adjustment: the poses of a few frames and the points they track, by the Schur complement.
+
+A window has W camera poses ``p_cam = R_k p_slam + t_k`` and N points ``p_slam``; observations are normalised image
+coordinates (x/z, y/z). The cost is the sum of
+
+* Geman-McClure reprojection errors in pixels: redescending, because moving highlights and shadow edges are consistent
+  outliers that a convex loss would average in,
+* the same loss on each point's distance from where the CAD surface or its neighbours put it,
+* the same loss on each pose's rotation from the one that fused poses of the past suggest,
+* squared changes of the angular and linear rate between consecutive frames of the window (constant-rate prior),
+* a weak square that holds the oldest frame and so fixes the gauge.
+
+Poses are updated from the left, ``R <- Exp(d) R`` and ``t <- t + tau``: the origin of the SLAM frame lies in the
+target, so turning and moving stay decoupled. Levenberg-Marquardt on iteratively reweighted normal equations, points
+eliminated first (Triggs et al., "Bundle adjustment - a modern synthesis", 2000, section 6.1). Plain compiled loops, no
+BLAS: the same bytes in every process.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+# Nearer than this share of the unit (the target's distance at the start) a point counts as behind the camera.
+_MIN_DEPTH = 1e-3
+# Squared scale, in sigmas, of the loss on expected points and rotations.
+_EXPECTED_CUTOFF_SQ = 9.0
+_FIRST_DAMPING = 1e-4
+
+
+class Problem(NamedTuple):
+    """What a window knows besides its state.
+
+    Attributes:
+        xn: (W, N, 2) normalised observations; seen: (W, N) which of them exist.
+        focal: pixels per unit of normalised coordinates.
+        sigma_px: standard deviation of an observation; cutoff_px: scale of its loss.
+        X_expected: (N, 3) expected points; X_info: (N,) their information (1/unit^2), 0 = none.
+        R_expected: (W, 3, 3) expected rotations; R_info: (W,) their information (1/rad^2), 0 = none.
+        dt: (W,) seconds since the previous frame of the window, first entry unused.
+        rate_info: (W, 2) information of the change of angular and linear rate about each frame, ends unused.
+        R_gauge: (3, 3), t_gauge: (3,) where the oldest frame is held; gauge_info: how firmly.
+    """
+
+    xn: Float
+    seen: Bool
+    focal: float
+    sigma_px: float
+    cutoff_px: float
+    X_expected: Float
+    X_info: Float
+    R_expected: Float
+    R_info: Float
+    dt: Float
+    rate_info: Float
+    R_gauge: Float
+    t_gauge: Float
+    gauge_info: float
+
+
+@njit(cache=True)
+def rotation(v: Float) -> Float:
+    """Rotation matrix (3, 3) of a rotation vector (3,) in radians."""
+    s = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    if s < 1e-12:
+        a, b = 1.0 - s / 6.0, 0.5 - s / 24.0
+    else:
+        angle = np.sqrt(s)
+        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / s
+    x, y, z = v[0], v[1], v[2]
+    R = np.empty((3, 3))
+    R[0, 0], R[0, 1], R[0, 2] = 1 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
+    R[1, 0], R[1, 1], R[1, 2] = b * x * y + a * z, 1 - b * (x * x + z * z), b * y * z - a * x
+    R[2, 0], R[2, 1], R[2, 2] = b * x * z - a * y, b * y * z + a * x, 1 - b * (x * x + y * y)
+    return R
+
+
+@njit(cache=True)
+def product(A: Float, B: Float) -> Float:
+    """Matrix product of two (3, 3)."""
+    C = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            C[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+    return C
+
+
+@njit(cache=True)
+def turn_between(R_b: Float, R_a: Float) -> Float:
+    """Rotation vector (3,) of ``R_b R_a^T``, for angles below 180 degrees."""
+    D = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            D[i, j] = R_b[i, 0] * R_a[j, 0] + R_b[i, 1] * R_a[j, 1] + R_b[i, 2] * R_a[j, 2]
+    v = np.empty(3)
+    v[0], v[1], v[2] = 0.5 * (D[2, 1] - D[1, 2]), 0.5 * (D[0, 2] - D[2, 0]), 0.5 * (D[1, 0] - D[0, 1])
+    sine = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    if sine > 1e-9:
+        v *= np.arctan2(sine, 0.5 * (D[0, 0] + D[1, 1] + D[2, 2] - 1.0)) / sine
+    return v
+
+
+@njit(cache=True)
+def cholesky_in_place(A: Float) -> bool:
+    """Lower factor of a symmetric matrix, read from and written to its lower triangle; False if not definite."""
+    for j in range(A.shape[0]):
+        for i in range(j, A.shape[0]):
+            s = A[i, j]
+            for k in range(j):
+                s -= A[i, k] * A[j, k]
+            if i > j:
+                A[i, j] = s / A[j, j]
+            elif s > 0.0:
+                A[j, j] = np.sqrt(s)
+            else:
+                return False
+    return True
+
+
+@njit(cache=True)
+def cholesky_solve(L: Float, b: Float) -> Float:
+    """Solution of ``L L^T x = b``."""
+    n = L.shape[0]
+    x = b.copy()
+    for i in range(n):
+        for k in range(i):
+            x[i] -= L[i, k] * x[k]
+        x[i] /= L[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            x[i] -= L[k, i] * x[k]
+        x[i] /= L[i, i]
+    return x
+
+
+@njit(cache=True)
+def _observe(R: Float, t: Float, X: Float, xn: Float, focal: float, r: Float, J_pose: Float, J_point: Float) -> bool:
+    """Residual (2,) px and its Jacobians (2, 6), (2, 3); False when the point is behind the camera."""
+    rx = R[0, 0] * X[0] + R[0, 1] * X[1] + R[0, 2] * X[2]
+    ry = R[1, 0] * X[0] + R[1, 1] * X[1] + R[1, 2] * X[2]
+    rz = R[2, 0] * X[0] + R[2, 1] * X[1] + R[2, 2] * X[2]
+    z = rz + t[2]
+    if z < _MIN_DEPTH:
+        return False
+    u, v, f = (rx + t[0]) / z, (ry + t[1]) / z, focal / z
+    r[0], r[1] = focal * (u - xn[0]), focal * (v - xn[1])
+    # d(u, v)/d(p_cam) = f [1 0 -u; 0 1 -v]; d(p_cam)/d(rotation) = -[R X]x.
+    J_pose[0, 0], J_pose[0, 1], J_pose[0, 2] = -f * u * ry, f * (rz + u * rx), -f * ry
+    J_pose[1, 0], J_pose[1, 1], J_pose[1, 2] = -f * (rz + v * ry), f * v * rx, f * rx
+    J_pose[0, 3], J_pose[0, 4], J_pose[0, 5] = f, 0.0, -f * u
+    J_pose[1, 3], J_pose[1, 4], J_pose[1, 5] = 0.0, f, -f * v
+    for j in range(3):
+        J_point[0, j] = f * (R[0, j] - u * R[2, j])
+        J_point[1, j] = f * (R[1, j] - v * R[2, j])
+    return True
+
+
+@njit(cache=True)
+def _loss(error_sq: float, cutoff_sq: float) -> float:
+    """Geman-McClure: the square near zero, ``cutoff_sq`` far away."""
+    return cutoff_sq * error_sq / (cutoff_sq + error_sq)
+
+
+@njit(cache=True)
+def _weight(error_sq: float, cutoff_sq: float) -> float:
+    """Weight of the square that has the same gradient as :func:`_loss`."""
+    q = cutoff_sq / (cutoff_sq + error_sq)
+    return q * q
+
+
+@njit(cache=True)
+def refine_pose(
+    R: Float, t: Float, X: Float, xn: Float, use: Bool, focal: float, sigma_px: float, cutoff_px: float,
+    R_expected: Float, t_expected: Float, turn_info: float, move_info: float, n_iterations: int,
+) -> tuple[Float, Float, Float]:  # fmt: skip
+    """Pose of one frame from known points, pulled towards an expected pose; Gauss-Newton.
+
+    Args:
+        R, t: (3, 3), (3,) start.
+        X: (N, 3) points; xn: (N, 2) normalised observations; use: (N,) which of them count.
+        focal, sigma_px, cutoff_px: as in :class:`Problem`.
+        R_expected, t_expected: expected pose; turn_info (1/rad^2), move_info (1/unit^2) its information.
+        n_iterations: steps.
+
+    Returns:
+        R (3, 3), t (3,), and the residual norms (N,) in pixels, infinite where there is none.
+    """
+    R, t = R.copy(), t.copy()
+    residual = np.full(len(X), np.inf)
+    H, b = np.empty((6, 6)), np.empty(6)
+    r, J, J_point = np.empty(2), np.empty((2, 6)), np.empty((2, 3))
+    for iteration in range(n_iterations + 1):
+        H[:], b[:], residual[:] = 0.0, 0.0, np.inf
+        for i in range(len(X)):
+            if not use[i] or not _observe(R, t, X[i], xn[i], focal, r, J, J_point):
+                continue
+            error_sq = r[0] * r[0] + r[1] * r[1]
+            residual[i] = np.sqrt(error_sq)
+            w = _weight(error_sq, cutoff_px * cutoff_px) / (sigma_px * sigma_px)
+            for a in range(6):
+                b[a] -= w * (J[0, a] * r[0] + J[1, a] * r[1])
+                for c in range(a + 1):
+                    H[a, c] += w * (J[0, a] * J[0, c] + J[1, a] * J[1, c])
+        if iteration == n_iterations:
+            break
+        turn = turn_between(R, R_expected)
+        for a in range(3):
+            H[a, a] += turn_info
+            H[a + 3, a + 3] += move_info
+            b[a] -= turn_info * turn[a]
+            b[a + 3] -= move_info * (t[a] - t_expected[a])
+        if not cholesky_in_place(H):
+            break
+        d = cholesky_solve(H, b)
+        R = product(rotation(d[:3]), R)
+        t += d[3:]
+    return R, t, residual
+
+
+@njit(cache=True)
+def window_cost(R: Float, t: Float, X: Float, p: Problem) -> float:
+    """Value of the cost (module text) at a state (W, 3, 3), (W, 3), (N, 3)."""
+    W, N = p.seen.shape
+    cutoff_sq = (p.cutoff_px / p.sigma_px) ** 2
+    scale = p.focal / p.sigma_px
+    cost = 0.0
+    for k in range(W):
+        for i in range(N):
+            if not p.seen[k, i]:
+                continue
+            x = R[k, 0, 0] * X[i, 0] + R[k, 0, 1] * X[i, 1] + R[k, 0, 2] * X[i, 2] + t[k, 0]
+            y = R[k, 1, 0] * X[i, 0] + R[k, 1, 1] * X[i, 1] + R[k, 1, 2] * X[i, 2] + t[k, 1]
+            z = R[k, 2, 0] * X[i, 0] + R[k, 2, 1] * X[i, 1] + R[k, 2, 2] * X[i, 2] + t[k, 2]
+            if z < _MIN_DEPTH:
+                cost += cutoff_sq
+                continue
+            u, v = scale * (x / z - p.xn[k, i, 0]), scale * (y / z - p.xn[k, i, 1])
+            cost += _loss(u * u + v * v, cutoff_sq)
+    for i in range(N):
+        if p.X_info[i] > 0.0:
+            d = X[i] - p.X_expected[i]
+            cost += _loss(p.X_info[i] * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), _EXPECTED_CUTOFF_SQ)
+    for k in range(W):
+        if p.R_info[k] > 0.0:
+            d = turn_between(R[k], p.R_expected[k])
+            cost += _loss(p.R_info[k] * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), _EXPECTED_CUTOFF_SQ)
+    for k in range(1, W - 1):
+        before, after = turn_between(R[k], R[k - 1]), turn_between(R[k + 1], R[k])
+        for a in range(3):
+            cost += p.rate_info[k, 0] * (after[a] / p.dt[k + 1] - before[a] / p.dt[k]) ** 2
+            change = (t[k + 1, a] - t[k, a]) / p.dt[k + 1] - (t[k, a] - t[k - 1, a]) / p.dt[k]
+            cost += p.rate_info[k, 1] * change**2
+    d = turn_between(R[0], p.R_gauge)
+    for a in range(3):
+        cost += p.gauge_info * (d[a] * d[a] + (t[0, a] - p.t_gauge[a]) ** 2)
+    return cost
+
+
+@njit(cache=True)
+def _add_rate_terms(S: Float, g: Float, R: Float, t: Float, p: Problem) -> None:
+    """Constant-rate prior: adds to the lower triangle of S (6W, 6W) and to the descent direction g (6W,)."""
+    J = np.empty((3, 3, 3))
+    c = np.empty(3)
+    for k in range(1, len(R) - 1):
+        before, after = turn_between(R[k], R[k - 1]), turn_between(R[k + 1], R[k])
+        A, B = product(R[k], R[k - 1].T), product(R[k + 1], R[k].T)
+        i1, i2 = 1.0 / p.dt[k], 1.0 / p.dt[k + 1]
+        for a in range(3):
+            for b in range(3):
+                unit = 1.0 if a == b else 0.0
+                J[0, a, b], J[1, a, b], J[2, a, b] = i1 * A[a, b], -i2 * B[a, b] - i1 * unit, i2 * unit
+        c[0], c[1], c[2] = i1, -i1 - i2, i2
+        w_turn, w_move = p.rate_info[k, 0], p.rate_info[k, 1]
+        for f in range(3):
+            row = 6 * (k - 1 + f)
+            for b in range(3):
+                for a in range(3):
+                    g[row + b] -= w_turn * J[f, a, b] * (after[a] * i2 - before[a] * i1)
+                g[row + 3 + b] -= w_move * c[f] * ((t[k + 1, b] - t[k, b]) * i2 - (t[k, b] - t[k - 1, b]) * i1)
+            for h in range(f + 1):
+                col = 6 * (k - 1 + h)
+                for b in range(3):
+                    S[row + 3 + b, col + 3 + b] += w_move * c[f] * c[h]
+                    for d in range(3):
+                        s = J[f, 0, b] * J[h, 0, d] + J[f, 1, b] * J[h, 1, d] + J[f, 2, b] * J[h, 2, d]
+                        S[row + b, col + d] += w_turn * s
+
+
+@njit(cache=True)
+def _add_pose_terms(S: Float, g: Float, R: Float, t: Float, p: Problem) -> None:
+    """Expected rotations and the gauge."""
+    for k in range(len(R)):
+        if p.R_info[k] > 0.0:
+            d = turn_between(R[k], p.R_expected[k])
+            w = p.R_info[k]
+            w *= _weight(w * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), _EXPECTED_CUTOFF_SQ)
+            for a in range(3):
+                S[6 * k + a, 6 * k + a] += w
+                g[6 * k + a] -= w * d[a]
+    d = turn_between(R[0], p.R_gauge)
+    for a in range(3):
+        S[a, a] += p.gauge_info
+        S[a + 3, a + 3] += p.gauge_info
+        g[a] -= p.gauge_info * d[a]
+        g[a + 3] -= p.gauge_info * (t[0, a] - p.t_gauge[a])
+
+
+@njit(cache=True)
+def _add_observations(
+    i: int, S: Float, g: Float, V: Float, b: Float, C: Float, R: Float, t: Float, X: Float, p: Problem
+) -> bool:
+    """Terms of point i: poses into S and g, the point into V (3, 3) and b (3,), the mixed block into C (W, 6, 3).
+
+    Returns False when nothing sees the point.
+    """
+    r, J, J_point = np.empty(2), np.empty((2, 6)), np.empty((2, 3))
+    V[:], b[:], C[:] = 0.0, 0.0, 0.0
+    any_seen = False
+    for k in range(len(R)):
+        if not p.seen[k, i] or not _observe(R[k], t[k], X[i], p.xn[k, i], p.focal, r, J, J_point):
+            continue
+        any_seen = True
+        w = _weight(r[0] * r[0] + r[1] * r[1], p.cutoff_px * p.cutoff_px) / (p.sigma_px * p.sigma_px)
+        o = 6 * k
+        for a in range(6):
+            w0, w1 = w * J[0, a], w * J[1, a]
+            g[o + a] -= w0 * r[0] + w1 * r[1]
+            for c in range(a + 1):
+                S[o + a, o + c] += w0 * J[0, c] + w1 * J[1, c]
+            for c in range(3):
+                C[k, a, c] = w0 * J_point[0, c] + w1 * J_point[1, c]
+        for a in range(3):
+            w0, w1 = w * J_point[0, a], w * J_point[1, a]
+            b[a] -= w0 * r[0] + w1 * r[1]
+            for c in range(a + 1):
+                V[a, c] += w0 * J_point[0, c] + w1 * J_point[1, c]
+    if p.X_info[i] > 0.0:
+        d = X[i] - p.X_expected[i]
+        w = p.X_info[i]
+        w *= _weight(w * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), _EXPECTED_CUTOFF_SQ)
+        for a in range(3):
+            V[a, a] += w
+            b[a] -= w * d[a]
+    return any_seen
+
+
+@njit(cache=True)
+def _eliminate(i: int, S: Float, g: Float, L: Float, b: Float, C: Float, Y: Float, p: Problem) -> None:
+    """Schur complement of point i, its block already factored as L L^T: S -= Y^T Y, g -= Y^T L^-1 b, Y = L^-1 C^T."""
+    y0 = b[0] / L[0, 0]
+    y1 = (b[1] - L[1, 0] * y0) / L[1, 1]
+    y2 = (b[2] - L[2, 0] * y0 - L[2, 1] * y1) / L[2, 2]
+    W = len(C)
+    for k in range(W):
+        for a in range(6):
+            v0 = C[k, a, 0] / L[0, 0]
+            v1 = (C[k, a, 1] - L[1, 0] * v0) / L[1, 1]
+            v2 = (C[k, a, 2] - L[2, 0] * v0 - L[2, 1] * v1) / L[2, 2]
+            Y[0, 6 * k + a], Y[1, 6 * k + a], Y[2, 6 * k + a] = v0, v1, v2
+            g[6 * k + a] -= v0 * y0 + v1 * y1 + v2 * y2
+    for k in range(W):
+        if not p.seen[k, i]:
+            continue
+        for row in range(6 * k, 6 * k + 6):
+            v0, v1, v2 = Y[0, row], Y[1, row], Y[2, row]
+            for col in range(6 * k + 6):
+                S[row, col] -= v0 * Y[0, col] + v1 * Y[1, col] + v2 * Y[2, col]
+
+
+@njit(cache=True)
+def _step_points(X: Float, step: Float, V: Float, b: Float, C: Float, solved: Bool, p: Problem) -> Float:
+    """Points after a step (6W,) of the poses: back-substitution."""
+    X_new = X.copy()
+    for i in range(len(X)):
+        if not solved[i]:
+            continue
+        v = b[i].copy()
+        for k in range(p.seen.shape[0]):
+            if p.seen[k, i]:
+                for a in range(6):
+                    for c in range(3):
+                        v[c] -= C[i, k, a, c] * step[6 * k + a]
+        X_new[i] += cholesky_solve(V[i], v)
+    return X_new
+
+
+@njit(cache=True)
+def adjust_window(R: Float, t: Float, X: Float, p: Problem, n_iterations: int) -> tuple[float, Float]:
+    """Minimise the cost in place.
+
+    Args:
+        R, t: (W, 3, 3), (W, 3) poses, oldest first, W >= 2.
+        X: (N, 3) points; those that no frame sees stay where they are.
+        p: the rest of the problem.
+        n_iterations: steps tried.
+
+    Returns:
+        The cost reached, and the covariance (12, 12) of rotation and position of the last two frames; infinite when
+        no step succeeded.
+    """
+    W, N = p.seen.shape
+    n = 6 * W
+    S, g, Y = np.empty((n, n)), np.empty(n), np.empty((3, n))
+    V, b, C = np.empty((N, 3, 3)), np.empty((N, 3)), np.empty((N, W, 6, 3))
+    solved = np.empty(N, np.bool_)
+    R_new, t_new = np.empty_like(R), np.empty_like(t)
+    covariance = np.full((12, 12), np.inf)
+    damping = _FIRST_DAMPING
+    cost = window_cost(R, t, X, p)
+    for _ in range(n_iterations):
+        S[:], g[:] = 0.0, 0.0
+        for i in range(N):
+            solved[i] = False
+            if not _add_observations(i, S, g, V[i], b[i], C[i], R, t, X, p):
+                continue
+            ridge = 1e-9 * (V[i, 0, 0] + V[i, 1, 1] + V[i, 2, 2])
+            for a in range(3):
+                V[i, a, a] += damping * V[i, a, a] + ridge
+            solved[i] = cholesky_in_place(V[i])
+            if solved[i]:
+                _eliminate(i, S, g, V[i], b[i], C[i], Y, p)
+        _add_rate_terms(S, g, R, t, p)
+        _add_pose_terms(S, g, R, t, p)
+        for a in range(n):
+            S[a, a] += damping * S[a, a] + 1e-9
+        if not cholesky_in_place(S):
+            damping *= 100.0
+            continue
+        step = cholesky_solve(S, g)
+        for k in range(W):
+            R_new[k] = product(rotation(step[6 * k : 6 * k + 3]), R[k])
+            t_new[k] = t[k] + step[6 * k + 3 : 6 * k + 6]
+        X_new = _step_points(X, step, V, b, C, solved, p)
+        new_cost = window_cost(R_new, t_new, X_new, p)
+        if not new_cost <= cost:
+            damping *= 10.0
+            continue
+        R[:], t[:], X[:] = R_new, t_new, X_new
+        for a in range(12):
+            unit = np.zeros(n)
+            unit[n - 12 + a] = 1.0
+            covariance[a] = cholesky_solve(S, unit)[n - 12 :]
+        damping = max(0.2 * damping, 1e-6)
+        gain, cost = cost - new_cost, new_cost
+        if gain < 1e-4 * cost:
+            break
+    return cost, covariance

@@ -1,0 +1,209 @@
+"""Backend ``feature``: target-relative motion from point tracks, without learned weights.
+
+Per frame: follow the points, locate the camera against the points known, adjust the window, emit. A pose once emitted
+is never revised. The window keeps improving its past, so what is emitted is the chain of its best increments.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hat_ros import lie
+from hat_ros.config import HatConfig
+from hat_ros.slam.surface import SurfacePrior
+from hat_ros.slam.tracks import PointTracks
+from hat_ros.slam.window import Window
+from hat_ros.target import Target
+from hat_ros.types import Camera, Detection, Frame, Motion, PosePrior
+
+Float = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+# Points needed to start, and points that must agree with a new pose.
+_MIN_POINTS = 8
+# A point this far off is wrong at this frame, px; wrong this often in a row, it is given up.
+_WRONG_PX, _WRONG_FRAMES = 3.0, 3
+# Frames in a row without an answer after which a new epoch starts.
+_LOST_FRAMES = 3
+# Depth of the first points: a bulge of this share of the radius towards the camera, known to this share.
+_FIRST_BULGE, _FIRST_SIGMA = 0.5, 0.5
+# Later points start at the depth of this many neighbours, known to this share of the relief.
+_NEIGHBOURS, _NEIGHBOUR_SIGMA = 5, 0.5
+_NEIGHBOUR_SOFTENING_PX = 5.0
+# Rival solutions are tried every so many frames: the mirror image, and the CAD's when it disagrees this much.
+_RIVAL_PERIOD = 5
+_MIN_SURFACE_AGREEMENT = 0.7
+
+
+class FeatureSlam:
+    """Monocular motion relative to a rigid target (masked) or to a static scene (unmasked).
+
+    Args:
+        config: the whole configuration; ``slam.feature``, ``slam.masked`` and ``prior`` are used.
+        target: the CAD model, for the depth that healthy priors bring; None = never use priors.
+    """
+
+    def __init__(self, config: HatConfig, target: Target | None) -> None:
+        self._config = config.slam.feature
+        self._masked = config.slam.masked
+        self._delay_frames = config.prior.delay_frames
+        self._target = target if config.slam.feature.use_prior else None
+        self._epoch = 0
+        self._camera: Camera | None = None
+        self._forget()
+
+    def update(self, frame: Frame, detection: Detection | None, prior: PosePrior | None) -> Motion:
+        """Advance by one frame.
+
+        Args:
+            frame: the frame, its background black when masked.
+            detection: the mask; needed when masked.
+            prior: fused poses of the past; used while healthy.
+
+        Returns:
+            ``T_slam_cam``; not valid when there is too little to go by.
+        """
+        if self._masked and detection is None:
+            return Motion.none(self._epoch)
+        if self._camera is not None and not _same_camera(self._camera, frame.camera):
+            self.reset()
+        self._camera = frame.camera
+        image = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+        region = detection.mask.view(np.uint8) if self._masked else np.ones(image.shape, np.uint8)
+        if self._window is None:
+            return self._start(frame.stamp_ns, image, region)
+        if not self._advance(frame.stamp_ns, image, region, prior):
+            self._n_lost += 1
+            if self._n_lost >= _LOST_FRAMES:
+                self.reset()
+            return Motion.none(self._epoch)
+        return self._motion()
+
+    def reset(self) -> None:
+        """Start a new epoch, if the present one has begun."""
+        if self._window is not None:
+            self._epoch += 1
+        self._forget()
+
+    def _forget(self) -> None:
+        self._window: Window | None = None
+        self._tracks = PointTracks(self._config.max_points, self._config.spacing_px)
+        self._surface: SurfacePrior | None = None
+        self._n_wrong = np.zeros(self._config.max_points, dtype=np.int64)
+        self._n_lost = 0
+        self._met_surface = False
+
+    def _start(self, stamp_ns: int, image: Image, region: Image) -> Motion:
+        """First frame of an epoch: defines the gauge, if it shows enough points."""
+        slots = self._tracks.replenish(image, region)
+        if len(slots) < _MIN_POINTS:
+            self._forget()
+            return Motion.none(self._epoch)
+        xn = self._normalise(self._tracks.xy[slots])
+        rows, cols = np.nonzero(region)
+        center = self._normalise(np.array([cols.mean(), rows.mean()]))
+        focal = float(np.sqrt(self._camera.K[0, 0] * self._camera.K[1, 1]))
+        radius = float(np.sqrt(len(rows) / np.pi) / focal)
+        self._window = Window(self._config, stamp_ns, center, radius)
+        self._window.focal = focal
+        z = np.ones(len(slots))
+        if self._masked:
+            z -= _FIRST_BULGE * radius * (bulge(region, self._tracks.xy[slots]) - 0.5)
+        self._window.place(slots, xn, z, _FIRST_SIGMA * radius)
+        if self._target is not None:
+            self._surface = SurfacePrior(self._config, self._target, self._delay_frames)
+            self._surface.remember(self._window, self._tracks.track_id)
+        self._R_emitted = np.eye(3)
+        return self._motion()
+
+    def _advance(self, stamp_ns: int, image: Image, region: Image, prior: PosePrior | None) -> bool:
+        """One frame more; False when the points do not say where it was taken."""
+        window, tracks = self._window, self._tracks
+        tracks.advance(image, region, self._guess(stamp_ns))
+        xn = self._normalise(tracks.xy)
+        R, t, residual_px = window.locate(stamp_ns, xn, tracks.alive)
+        right = residual_px < _WRONG_PX
+        if np.count_nonzero(right) < _MIN_POINTS:
+            return False
+        self._n_lost = 0
+        self._n_wrong = np.where(right, 0, self._n_wrong + 1)
+        seen = tracks.alive.copy()
+        tracks.alive &= self._n_wrong < _WRONG_FRAMES
+        window.thin(tracks.alive)
+        window.append(stamp_ns, R, t, xn, seen)
+        if self._surface is not None:
+            self._surface.remember(window, tracks.track_id)
+            if prior is not None and prior.healthy:
+                self._surface.expect(window, tracks.track_id, prior)
+        window.adjust()
+        self._try_rivals()
+        self._R_emitted = window.R[-1] @ window.R[-2].T @ self._R_emitted
+        self._replenish(image, region)
+        return True
+
+    def _try_rivals(self) -> None:
+        window = self._window
+        phase = window.number[-1] % _RIVAL_PERIOD
+        if phase == 0 and len(window) > 3:
+            window.try_mirror()
+        agreement = window.surface_agreement()
+        if not self._met_surface and (window.n_surface > 0).sum() >= _MIN_POINTS:
+            self._met_surface = True
+            window.try_expected()
+        elif phase == 2 and agreement < _MIN_SURFACE_AGREEMENT:
+            window.try_expected()
+
+    def _guess(self, stamp_ns: int) -> Float:
+        """(N, 2) expected pixel positions: where the points are now plus their predicted displacement."""
+        window = self._window
+        R, t = window.predict(stamp_ns)
+        before = window.points_in_camera(window.R[-1], window.t[-1])
+        after = window.points_in_camera(R, t)
+        front = (before[:, 2] > 0) & (after[:, 2] > 0)
+        before, after = np.where(front[:, None], before, 1.0), np.where(front[:, None], after, 1.0)
+        return self._tracks.xy + self._camera.project(after) - self._camera.project(before)
+
+    def _replenish(self, image: Image, region: Image) -> None:
+        window, tracks = self._window, self._tracks
+        known = np.flatnonzero(tracks.alive)
+        slots = tracks.replenish(image, region)
+        if not len(slots) or not len(known):
+            return
+        z = window.points_in_camera(window.R[-1], window.t[-1])[known, 2]
+        distance_sq = ((tracks.xy[slots][:, None] - tracks.xy[known]) ** 2).sum(axis=-1)
+        nearest = np.argsort(distance_sq, axis=1, kind="stable")[:, :_NEIGHBOURS]
+        weight = 1.0 / (np.take_along_axis(distance_sq, nearest, axis=1) + _NEIGHBOUR_SOFTENING_PX**2)
+        relief = max(1.48 * float(np.median(np.abs(z - np.median(z)))), 0.1 * window.radius)
+        window.place(
+            slots,
+            self._normalise(tracks.xy[slots]),
+            (weight * z[nearest]).sum(axis=1) / weight.sum(axis=1),
+            _NEIGHBOUR_SIGMA * relief,
+        )
+        self._n_wrong[slots] = 0
+
+    def _motion(self) -> Motion:
+        window = self._window
+        T_slam_cam = lie.inverse(lie.transform(self._R_emitted, window.t[-1]))
+        sigma_rad = window.step_sigma_rad() if len(window) > 1 else 0.0
+        return Motion(True, self._epoch, lie.row_from_matrix(T_slam_cam), len(window), sigma_rad)
+
+    def _normalise(self, xy: Float) -> Float:
+        """Normalised coordinates of pixels: (..., 2) -> (..., 2)."""
+        K = self._camera.K
+        y = (xy[..., 1] - K[1, 2]) / K[1, 1]
+        return np.stack([(xy[..., 0] - K[0, 2] - K[0, 1] * y) / K[0, 0], y], axis=-1)
+
+
+def bulge(region: Image, xy: Float) -> Float:
+    """Height (n,) in [0, 1] of a cushion over the region at (n, 2) pixels: half a circle over the distance inwards."""
+    inwards = cv2.distanceTransform(region, cv2.DIST_L2, 5)
+    col, row = np.rint(xy).astype(int).T
+    share = inwards[row, col].astype(np.float64) / max(float(inwards.max()), 1.0)
+    return np.sqrt(1.0 - (1.0 - share) ** 2)
+
+
+def _same_camera(a: Camera, b: Camera) -> bool:
+    return a is b or (a.width, a.height) == (b.width, b.height) and np.array_equal(a.K, b.K)

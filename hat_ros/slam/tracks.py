@@ -1,0 +1,143 @@
+"""Point tracks: pyramidal Lucas-Kanade on the target's crop, checked backwards.
+
+Tracks live in a fixed number of slots; a slot keeps its point until that is lost, then takes a new one. Points may lie
+up to the edge of the silhouette: before a black background the corners of panels are the best there are.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+Image = NDArray[np.uint8]
+
+_WINDOW_PX = 17
+_LEVELS = 3
+_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
+_MIN_EIGENVALUE = 1e-4
+# A track followed back must end this close to its start.
+_BACKWARD_TOLERANCE_PX = 0.4
+# Room around the points for the window at the coarsest pyramid level.
+_CROP_PAD_PX = 32
+# Weakest corner accepted, as a share of the strongest (Shi and Tomasi's smaller eigenvalue).
+_CORNER_QUALITY = 0.004
+
+
+class PointTracks:
+    """Tracks of at most ``n_slots`` points.
+
+    Args:
+        n_slots: number of slots N.
+        spacing_px: smallest distance between a new point and any other.
+
+    Attributes:
+        xy: (N, 2) pixel positions in the newest image.
+        alive: (N,) which slots hold a point.
+        track_id: (N,) identity of each slot's point; a number is never used again.
+    """
+
+    def __init__(self, n_slots: int, spacing_px: float) -> None:
+        self._spacing_px = spacing_px
+        self.xy = np.zeros((n_slots, 2))
+        self.alive = np.zeros(n_slots, dtype=bool)
+        self.track_id = np.full(n_slots, -1)
+        self._next_id = 0
+        self._image: Image | None = None
+
+    def advance(self, image: Image, region: Image, xy_guess: Float) -> None:
+        """Follow all points into the next image; those that are lost or leave the region free their slots.
+
+        Args:
+            image: (H, W) uint8, background black.
+            region: (H, W) uint8, nonzero where points may lie.
+            xy_guess: (N, 2) expected positions.
+        """
+        slots = np.flatnonzero(self.alive)
+        xy, found = follow(self._image, image, self.xy[slots], xy_guess[slots])
+        size = np.array([image.shape[1], image.shape[0]]) - 1
+        col, row = np.clip(np.rint(xy).astype(int), 0, size).T
+        found &= region[row, col] > 0
+        self.xy[slots] = xy
+        self.alive[slots[~found]] = False
+        self._image = image
+
+    def replenish(self, image: Image, region: Image) -> NDArray[np.int64]:
+        """Fill free slots with new corners; returns the slots filled."""
+        self._image = image
+        free = np.flatnonzero(~self.alive)
+        corners = detect(image, region, self.xy[self.alive], len(free), self._spacing_px)
+        slots = free[: len(corners)]
+        self.xy[slots] = corners
+        self.alive[slots] = True
+        self.track_id[slots] = self._next_id + np.arange(len(slots))
+        self._next_id += len(slots)
+        return slots
+
+
+def follow(previous: Image, current: Image, xy: Float, xy_guess: Float) -> tuple[Float, Bool]:
+    """Positions of points in the next image.
+
+    Args:
+        previous, current: (H, W) uint8 images.
+        xy: (M, 2) pixel positions in ``previous``; xy_guess: (M, 2) expected ones in ``current``.
+
+    Returns:
+        (M, 2) positions, and (M,) whether they were found and lead back to where they came from.
+    """
+    if not len(xy):
+        return xy.copy(), np.zeros(0, dtype=bool)
+    xy_guess = np.clip(xy_guess, 0, np.array([previous.shape[1], previous.shape[0]]) - 1)
+    x0, y0, x1, y1 = _crop(previous.shape, np.concatenate([xy, xy_guess]))
+    before = np.ascontiguousarray(previous[y0:y1, x0:x1])
+    after = np.ascontiguousarray(current[y0:y1, x0:x1])
+    origin = np.array([x0, y0], dtype=np.float64)
+    start, guess = (xy - origin).astype(np.float32), (xy_guess - origin).astype(np.float32)
+    options = {
+        "winSize": (_WINDOW_PX, _WINDOW_PX),
+        "criteria": _CRITERIA,
+        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+        "minEigThreshold": _MIN_EIGENVALUE,
+    }
+    moved, ok, _ = cv2.calcOpticalFlowPyrLK(before, after, start, guess, maxLevel=_LEVELS, **options)
+    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, start.copy(), maxLevel=1, **options)
+    found = (ok[:, 0] > 0) & (ok_back[:, 0] > 0) & (np.linalg.norm(back - start, axis=1) < _BACKWARD_TOLERANCE_PX)
+    size = np.array([x1 - x0, y1 - y0])
+    found &= ((moved >= 0) & (moved <= size - 1)).all(axis=1)
+    return moved.astype(np.float64) + origin, found
+
+
+def detect(image: Image, region: Image, taken: Float, count: int, spacing_px: float) -> Float:
+    """Strongest corners of a region, clear of points already taken.
+
+    Args:
+        image: (H, W) uint8.
+        region: (H, W) uint8, nonzero where points may lie.
+        taken: (M, 2) pixel positions to keep ``spacing_px`` away from.
+        count: how many at most.
+        spacing_px: smallest distance between points.
+
+    Returns:
+        (n, 2) pixel positions, strongest first.
+    """
+    x, y, width, height = cv2.boundingRect(region)
+    if min(width, height) < _WINDOW_PX // 2 or count <= 0:
+        return np.zeros((0, 2))
+    free = region[y : y + height, x : x + width].copy()
+    for u, v in np.rint(taken).astype(int).tolist():
+        cv2.circle(free, (u - x, v - y), max(1, round(spacing_px)), 0, -1)
+    crop = np.ascontiguousarray(image[y : y + height, x : x + width])
+    corners = cv2.goodFeaturesToTrack(crop, count, _CORNER_QUALITY, spacing_px, mask=free, blockSize=5)
+    if corners is None:
+        return np.zeros((0, 2))
+    return corners[:, 0].astype(np.float64) + np.array([x, y])
+
+
+def _crop(shape: tuple[int, ...], xy: Float) -> tuple[int, int, int, int]:
+    """Half-open pixel box x0, y0, x1, y1 around points, padded and clipped to the image."""
+    height, width = shape[:2]
+    x0, y0 = np.floor(xy.min(axis=0)).astype(int) - _CROP_PAD_PX
+    x1, y1 = np.ceil(xy.max(axis=0)).astype(int) + _CROP_PAD_PX + 1
+    return max(int(x0), 0), max(int(y0), 0), min(int(x1), width), min(int(y1), height)

@@ -1,0 +1,223 @@
+"""The window: recent and spread-out frames of one epoch, the points they see, and what is expected of both.
+
+The SLAM frame is fixed to the target, its axes those of the first camera, its origin at the target's apparent centre,
+its unit the distance at the start. Frames are kept ever more sparsely with age, because ten neighbours of a slow tumble
+say nothing about depth where sixty frames do (bas-relief ambiguity).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hat_ros import lie
+from hat_ros.config import FeatureSlamConfig
+from hat_ros.slam.bundle import Problem, adjust_window, refine_pose, turn_between
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+# Newest frames that are never thinned out.
+_RECENT_FRAMES = 5
+# Fewer live tracks than this tie a frame to the present no longer.
+_MIN_SHARED_POINTS = 8
+# Holds the oldest frame: one over this squared is far above the noise of a pose, far below what it must resist.
+_GAUGE_INFO = 1e4
+# Loss scale of the first rounds on a new frame, px: wide enough for a poor prediction.
+_WIDE_CUTOFF_PX = 6.0
+# How much looser than between frames of the window the prediction of a new pose is.
+_PREDICTION_SLACK = 3.0
+# One-sigma turn (rad) and move (radii) of a second frame, about which nothing is known.
+_FIRST_TURN_RAD, _FIRST_MOVE_RADII = 0.35, 1.0
+# A rival solution must be this much cheaper, relative and absolute, to take over.
+_RIVAL_SHARE, _RIVAL_MARGIN = 0.9, 20.0
+_RIVAL_ITERATIONS = 8
+_MIRROR = np.diag([1.0, 1.0, -1.0])
+
+
+class Window:
+    """State of one epoch.
+
+    Args:
+        config: settings.
+        stamp_ns: first frame.
+        center_xn: (2,) normalised image coordinates of the target's centre.
+        radius: apparent radius of the target in normalised coordinates, equal to SLAM units at the start.
+
+    Attributes:
+        stamps_ns, number: of the W frames, oldest first; ``number`` counts frames of the epoch.
+        R, t: (W, 3, 3), (W, 3) poses ``p_cam = R p_slam + t``.
+        xn, seen: (W, N, 2), (W, N) normalised observations and which of them exist.
+        X: (N, 3) points. X_expected, X_info: where they are expected and how firmly (1/unit^2).
+        n_surface: (N,) how often the CAD surface was seen at the point; 0 = expected from its neighbours only.
+        R_expected, R_info: (W, 3, 3), (W,) rotations that fused poses suggest.
+        cost: of the last adjustment; covariance: (12, 12) of the last two poses.
+    """
+
+    def __init__(self, config: FeatureSlamConfig, stamp_ns: int, center_xn: Float, radius: float) -> None:
+        n = config.max_points
+        self._config = config
+        self.radius = radius
+        self.focal = 1.0
+        self.stamps_ns = [stamp_ns]
+        self.number = [0]
+        self.R = np.eye(3)[None].copy()
+        self.t = np.array([[center_xn[0], center_xn[1], 1.0]])
+        self.xn = np.zeros((1, n, 2))
+        self.seen = np.zeros((1, n), dtype=bool)
+        self.X = np.zeros((n, 3))
+        self.X_expected = np.zeros((n, 3))
+        self.X_info = np.zeros(n)
+        self.n_surface = np.zeros(n, dtype=np.int64)
+        self.R_expected = np.eye(3)[None].copy()
+        self.R_info = np.zeros(1)
+        self.cost = 0.0
+        self.covariance = np.full((12, 12), np.inf)
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def points_in_camera(self, R: Float, t: Float) -> Float:
+        """(N, 3) points in the camera of a pose."""
+        return self.X @ R.T + t
+
+    def predict(self, stamp_ns: int) -> tuple[Float, Float]:
+        """Pose at a later stamp at constant rate: R (3, 3), t (3,)."""
+        if len(self) < 2:
+            return self.R[-1].copy(), self.t[-1].copy()
+        ahead = (stamp_ns - self.stamps_ns[-1]) / (self.stamps_ns[-1] - self.stamps_ns[-2])
+        turn = turn_between(self.R[-1], self.R[-2])
+        return lie.so3_exp(ahead * turn) @ self.R[-1], self.t[-1] + ahead * (self.t[-1] - self.t[-2])
+
+    def locate(self, stamp_ns: int, xn: Float, use: Bool) -> tuple[Float, Float, Float]:
+        """Pose of a new frame from the points known: R, t and (N,) residuals in pixels, infinite where unused.
+
+        Args:
+            stamp_ns: its stamp.
+            xn: (N, 2) normalised observations; use: (N,) which of them exist.
+        """
+        R0, t0 = self.predict(stamp_ns)
+        dt = (stamp_ns - self.stamps_ns[-1]) * 1e-9
+        if len(self) < 2:
+            turn, move = _FIRST_TURN_RAD, _FIRST_MOVE_RADII * self.radius
+        else:
+            turn = _PREDICTION_SLACK * np.radians(self._config.turn_acceleration_deg_s2) * dt * dt
+            move = _PREDICTION_SLACK * self._config.move_acceleration_radii_s2 * self.radius * dt * dt
+        R, t = R0, t0
+        for cutoff_px in (_WIDE_CUTOFF_PX, self._config.cutoff_px):
+            R, t, residual_px = refine_pose(
+                R, t, self.X, xn, use, self.focal, self._config.sigma_px, cutoff_px, R0, t0, turn**-2, move**-2, 4
+            )
+        return R, t, residual_px
+
+    def append(self, stamp_ns: int, R: Float, t: Float, xn: Float, seen: Bool) -> None:
+        """Add a frame: its pose, (N, 2) observations and which of them exist."""
+        self.stamps_ns.append(stamp_ns)
+        self.number.append(self.number[-1] + 1)
+        self.R, self.t = np.concatenate([self.R, R[None]]), np.concatenate([self.t, t[None]])
+        self.xn, self.seen = np.concatenate([self.xn, xn[None]]), np.concatenate([self.seen, seen[None]])
+        self.R_expected = np.concatenate([self.R_expected, R[None]])
+        self.R_info = np.append(self.R_info, 0.0)
+
+    def place(self, slots: NDArray[np.int64], xn: Float, z: Float, sigma: float) -> None:
+        """New points in slots, seen by the newest frame at (n, 2) with expected depth (n,) +- sigma."""
+        in_camera = np.concatenate([xn, np.ones((len(xn), 1))], axis=1) * z[:, None]
+        self.X[slots] = self.X_expected[slots] = (in_camera - self.t[-1]) @ self.R[-1]
+        self.X_info[slots] = sigma**-2
+        self.n_surface[slots] = 0
+        self.seen[:, slots] = False
+        self.seen[-1, slots] = True
+        self.xn[-1, slots] = xn
+
+    def thin(self, alive: Bool) -> None:
+        """Make room for a frame: drop the oldest once nothing ties it to the present, else the most crowded."""
+        span = self._config.window_span_frames
+        while len(self) > 3 and (
+            np.count_nonzero(self.seen[0] & alive) < _MIN_SHARED_POINTS or self.number[-1] - self.number[0] > span
+        ):
+            self._remove(0)
+        if len(self) >= self._config.window_frames:
+            now = self.number[-1] + 1
+            gap = [
+                (self.number[k + 1] - self.number[k - 1]) / (now - self.number[k])
+                for k in range(1, len(self) - _RECENT_FRAMES)
+            ]
+            self._remove(1 + int(np.argmin(gap)))
+
+    def _remove(self, k: int) -> None:
+        del self.stamps_ns[k], self.number[k]
+        for name in ("R", "t", "xn", "seen", "R_expected", "R_info"):
+            setattr(self, name, np.delete(getattr(self, name), k, axis=0))
+
+    def adjust(self) -> None:
+        """Bundle-adjust the window."""
+        self.cost, self.covariance = adjust_window(self.R, self.t, self.X, self._problem(), self._config.iterations)
+
+    def try_mirror(self) -> bool:
+        """Whether the depth-reversed solution fits better; if so it takes over.
+
+        Seen from afar, a relief turning one way and its mirror image turning the other way look the same (Necker
+        reversal); only perspective and expected points tell them apart, and the descent cannot cross over.
+        """
+        k = len(self) // 2
+        seen = self.seen.any(axis=0)
+        in_camera = self.points_in_camera(self.R[k], self.t[k])
+        center = np.median(in_camera[seen], axis=0)
+        X = ((in_camera - center) @ _MIRROR + center - self.t[k]) @ self.R[k]
+        center_slam = (center - self.t[k]) @ self.R[k]
+        R = _MIRROR @ (self.R @ self.R[k].T) @ _MIRROR @ self.R[k]
+        t = self.t + (self.R - R) @ center_slam
+        # What neighbours suggested was a guess in the spirit of the solution it came from: it turns with it.
+        guessed = (self.n_surface == 0)[:, None]
+        return self._try(R, t, X, np.where(guessed, X, self.X_expected))
+
+    def try_expected(self) -> bool:
+        """Whether the structure that the CAD surface suggests fits better; if so it takes over."""
+        known = self.n_surface > 0
+        X = np.where(known[:, None], self.X_expected, self.X)
+        R, t = self.R.copy(), self.t.copy()
+        for k in range(len(self)):
+            use = self.seen[k] & known
+            if np.count_nonzero(use) >= _MIN_SHARED_POINTS:
+                R[k], t[k], _ = refine_pose(
+                    R[k], t[k], X, self.xn[k], use, self.focal, self._config.sigma_px, _WIDE_CUTOFF_PX, R[k], t[k],
+                    1.0, 1.0, 8,
+                )  # fmt: skip
+        return self._try(R, t, X, self.X_expected)
+
+    def _try(self, R: Float, t: Float, X: Float, X_expected: Float) -> bool:
+        R, t = np.ascontiguousarray(R), np.ascontiguousarray(t)
+        problem = self._problem()._replace(X_expected=X_expected)
+        cost, covariance = adjust_window(R, t, X, problem, _RIVAL_ITERATIONS)
+        if cost > _RIVAL_SHARE * self.cost - _RIVAL_MARGIN:
+            return False
+        self.R, self.t, self.X, self.X_expected = R, t, X, X_expected
+        self.cost, self.covariance = cost, covariance
+        return True
+
+    def surface_agreement(self) -> float:
+        """Share of the points in use whose position the CAD surface confirms (two sigmas); 1 when it knows too few."""
+        known = self.seen.any(axis=0) & (self.n_surface > 0)
+        if np.count_nonzero(known) < _MIN_SHARED_POINTS:
+            return 1.0
+        offset = np.linalg.norm(self.X[known] - self.X_expected[known], axis=1) * np.sqrt(self.X_info[known])
+        return float(np.mean(offset < 2.0))
+
+    def step_sigma_rad(self) -> float:
+        """One-sigma angle of the turn from the last frame but one to the last."""
+        A = self.R[-1] @ self.R[-2].T
+        J = np.zeros((3, 12))
+        J[:, :3], J[:, 6:9] = -A, np.eye(3)
+        return float(np.sqrt(np.trace(J @ self.covariance @ J.T)))
+
+    def _problem(self) -> Problem:
+        seconds = (np.array(self.stamps_ns, dtype=np.int64) - self.stamps_ns[0]) * 1e-9
+        dt = np.diff(seconds, prepend=-1.0)
+        rate_info = np.zeros((len(self), 2))
+        span = 0.5 * (dt[1:-1] + dt[2:])
+        rate_info[1:-1, 0] = (np.radians(self._config.turn_acceleration_deg_s2) * span) ** -2
+        rate_info[1:-1, 1] = (self._config.move_acceleration_radii_s2 * self.radius * span) ** -2
+        return Problem(
+            self.xn, self.seen, self.focal, self._config.sigma_px, self._config.cutoff_px, self.X_expected, self.X_info,
+            self.R_expected, self.R_info, dt, rate_info, self.R[0].copy(), self.t[0].copy(), _GAUGE_INFO,
+        )  # fmt: skip
