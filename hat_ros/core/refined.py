@@ -6,13 +6,12 @@ like an anchor: it becomes the output, and with it the previous output of the ne
 
 At keyframes the selected anchor competes with the track:
 
-* Within D of the track it is one basin: the better of the two refinements wins, and the anchor serves as a second start
-  when the track's own refinement fails.
+* Within D of the track it is one basin, and the anchor one more start for the refinement: the best result wins.
 * Beyond D it is a rival. Successive rivals that follow from each other (the paper's coherence) add up; the image may
   decide early. The rival takes over when it is supported and the track is not, when its lead in image evidence, summed
   over coherent rivals, reaches ``arbitration_margin``, or after ``reset_anchors`` coherent rivals as in the paper,
-  unless the image speaks against them by that margin. Before the warm-up is over a single rival is enough: the first
-  anchors are chosen by appearance alone.
+  unless the image speaks against them by that margin. Until as many anchors as the fusion's warm-up have agreed with
+  the track, a single rival is enough: the first ones are chosen by appearance alone.
 
 With neither refinement accepted, the output is what the paper's fusion makes of prediction and anchor, and it coasts.
 """
@@ -56,6 +55,7 @@ class RefinedFusion:
     def lose(self) -> None:
         """Give the track up: the next supported anchor starts afresh."""
         self._output: tuple[Float, Motion] | None = None
+        self._n_agreed = 0
         self._measured: deque[tuple[int, Float]] = deque(maxlen=_RATE_HISTORY)
         self._forget_rivals()
 
@@ -71,6 +71,7 @@ class RefinedFusion:
         if fused.reset:
             self.alignment.reset()
             self._measured.clear()
+            self._n_agreed = 0
         if fused.measurement is not None:
             self._measured.append((frame.stamp_ns, fused.measurement))
             if anchor is not None and motion.valid:
@@ -87,7 +88,7 @@ class RefinedFusion:
         anchor: Float | None,
         confidence: float,
     ) -> Fused:
-        track = self._first_accepted(frame, detection, predictions)
+        track = self._best_refined(frame, detection, predictions)
         if not predictions:
             return self._start(frame, detection, anchor)
         predicted = predictions[0]
@@ -96,6 +97,7 @@ class RefinedFusion:
         reference = predicted if track is None else track.T_cam_target
         if not self._dissent.update(anchor, reference):
             self._forget_rivals()
+            self._n_agreed += 1
             return self._agree(frame, detection, track, predicted, anchor, confidence)
         return self._arbitrate(frame, detection, track, predicted, anchor)
 
@@ -103,7 +105,7 @@ class RefinedFusion:
         """Without a track, an anchor that the image supports starts one; the very first may start unsupported."""
         if anchor is None:
             return Fused(None)
-        refined = self._first_accepted(frame, detection, [anchor])
+        refined = self._best_refined(frame, detection, [anchor])
         return replace(_outcome(refined, anchor, None), gate_weight=1.0)
 
     def _agree(
@@ -116,11 +118,7 @@ class RefinedFusion:
         confidence: float,
     ) -> Fused:
         """Anchor and track share a basin: the better refinement, else the paper's fusion of the two."""
-        apart = lie.angle_between(anchor[:3, :3], (predicted if track is None else track.T_cam_target)[:3, :3])
-        if track is None or apart > np.radians(self._refinement.same_pose_deg):
-            other = self._first_accepted(frame, detection, [anchor])
-            if quality(other) > quality(track):
-                track = other
+        track = self._best_refined(frame, detection, [anchor], track)
         between = fuse_two(anchor, confidence, predicted, self._fusion, self._alignment_config.lever_m_per_rad)
         return replace(_outcome(track, between, predicted), gate_weight=1.0)
 
@@ -128,10 +126,10 @@ class RefinedFusion:
         self, frame: Frame, detection: Detection | None, track: Refined | None, predicted: Float, anchor: Float
     ) -> Fused:
         """Anchor and track stand in different basins: weigh the evidence so far."""
-        rival = self._first_accepted(frame, detection, [anchor])
+        rival = self._best_refined(frame, detection, [anchor])
         lead = quality(rival) - quality(track)
         self._lead = lead if self._dissent.count == 1 else self._lead + lead
-        settled = self.alignment.n_observations >= self._fusion.warmup_observations
+        settled = self._n_agreed >= self._fusion.warmup_observations
         needed = self._alignment_config.reset_anchors if settled else 1
         margin = self._refinement.arbitration_margin
         takes_over = (
@@ -166,13 +164,19 @@ class RefinedFusion:
             out.append(lie.matrix_from_row(row))
         return out or [output]
 
-    def _first_accepted(self, frame: Frame, detection: Detection | None, starts: list[Float]) -> Refined | None:
-        """Refine from each start until the image supports one."""
+    def _best_refined(
+        self, frame: Frame, detection: Detection | None, starts: list[Float], best: Refined | None = None
+    ) -> Refined | None:
+        """The best supported refinement of the starts; one close to a pose already refined is not tried again."""
         for start in starts:
+            if best is not None:
+                apart_rad = lie.angle_between(start[:3, :3], best.T_cam_target[:3, :3])
+                if apart_rad <= np.radians(self._refinement.same_pose_deg):
+                    continue
             refined = self._refiner.refine(frame, detection, start)
-            if refined is not None and self._is_supported(refined):
-                return refined
-        return None
+            if refined is not None and self._is_supported(refined) and quality(refined) > quality(best):
+                best = refined
+        return best
 
     def _is_supported(self, refined: Refined) -> bool:
         overlaps = np.isnan(refined.overlap) or refined.overlap >= self._refinement.min_overlap
