@@ -8,17 +8,13 @@ two seconds and kept in the platform's cache folder.
 
 from __future__ import annotations
 
-import hashlib
-import io
-import os
-import tempfile
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hat_ros.cache import cached_arrays
 from hat_ros.refinement.contour import COL_WEIGHT, contour_table
 from hat_ros.render import Renderer
 from hat_ros.target import Target
@@ -33,7 +29,6 @@ CONTOUR_POINTS = 96
 # Distance of the virtual camera in bounding radii: far enough that perspective matters little, near enough to be real.
 _DISTANCE_RADII = 8.0
 _RENDER_PX = 112
-_DIGEST_BYTES = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +43,7 @@ class ViewBank:
         centroid: (V, 2) silhouette centroid, tangent units, from the projected centre.
         contour_m: (V, P, 3) contour points in the target frame.
         contour_weight: (V, P) contour length each stands for, zero where unused.
-        distance_m: distance of the virtual camera from the centre.
+        distance_m: () distance of the virtual camera from the centre.
     """
 
     R_cam_target: NDArray[np.float64]
@@ -58,7 +53,7 @@ class ViewBank:
     centroid: NDArray[np.float64]
     contour_m: NDArray[np.float64]
     contour_weight: NDArray[np.float64]
-    distance_m: float
+    distance_m: NDArray[np.float64]
 
     @property
     def n_angles(self) -> int:
@@ -67,24 +62,12 @@ class ViewBank:
 
 
 def load_or_build(target: Target, renderer: Renderer, n_views: int, n_angles: int) -> ViewBank:
-    """The bank of a target from the cache folder, built and stored there when absent, corrupt or of another format.
-
-    A cache that cannot be written is no error: the bank is then built again next time.
-    """
+    """The bank of a target from the cache folder, built and stored there when it is absent or damaged."""
     settings = f"{_FORMAT}:{n_views}:{n_angles}:{N_RINGS}:{MAX_RADIUS}:{CONTOUR_POINTS}:{_DISTANCE_RADII}:{_RENDER_PX}"
-    key = hashlib.sha256(f"{target.sha256}:{settings}".encode()).hexdigest()
-    path = cache_folder() / f"views-{key[:32]}.npz"
-    bank = _read(path, n_views, n_angles)
-    if bank is None:
-        bank = build(target, renderer, n_views, n_angles)
-        _write(path, bank)
-    return bank
-
-
-def cache_folder() -> Path:
-    """Where banks are kept: ``$XDG_CACHE_HOME/hat_ros``, by default ``~/.cache/hat_ros``."""
-    base = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(base) if os.path.isabs(base) else Path("~/.cache").expanduser()) / "hat_ros"
+    arrays = cached_arrays(
+        "views", f"{target.sha256}:{settings}", lambda: vars(build(target, renderer, n_views, n_angles))
+    )
+    return ViewBank(**arrays)
 
 
 def build(target: Target, renderer: Renderer, n_views: int, n_angles: int) -> ViewBank:
@@ -113,7 +96,7 @@ def build(target: Target, renderer: Renderer, n_views: int, n_angles: int) -> Vi
         weight[i, : len(table)] = table[:, COL_WEIGHT]
     spectrum = np.ascontiguousarray(np.fft.rfft(rings, axis=1).transpose(1, 0, 2).astype(np.complex64))
     area = (rings @ ring_weights()).sum(axis=1)
-    return ViewBank(rotations, spectrum, area, gyration, centroid, contour, weight, distance_m=float(distance))
+    return ViewBank(rotations, spectrum, area, gyration, centroid, contour, weight, np.array(distance))
 
 
 def mask_moments(mask: NDArray[np.bool_]) -> tuple[NDArray[np.float64], float]:
@@ -189,33 +172,3 @@ def _icosphere(n_vertices: int) -> NDArray[np.float64]:
             finer += [(face[i], mids[i], mids[i - 1]) for i in range(3)] + [tuple(mids)]
         faces = finer
     return np.array(points)
-
-
-def _write(path: Path, bank: ViewBank) -> None:
-    """Store a bank atomically: payload, then its SHA-256; silently not at all where the folder is not writable."""
-    buffer = io.BytesIO()
-    np.savez(buffer, **vars(bank))
-    payload = buffer.getvalue()
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".partial", delete=False) as file:
-            file.write(hashlib.sha256(payload).digest() + payload)
-        os.replace(file.name, path)
-    except OSError:
-        return
-
-
-def _read(path: Path, n_views: int, n_angles: int) -> ViewBank | None:
-    """The bank in a file, None when there is none or its bytes are not what was written."""
-    try:
-        data = path.read_bytes()
-    except OSError:
-        return None
-    digest, payload = data[:_DIGEST_BYTES], data[_DIGEST_BYTES:]
-    if hashlib.sha256(payload).digest() != digest:
-        return None
-    with np.load(io.BytesIO(payload), allow_pickle=False) as arrays:
-        fields = {name: arrays[name] for name in arrays.files}
-    fields["distance_m"] = float(fields["distance_m"])
-    bank = ViewBank(**fields)
-    return bank if bank.n_angles == n_angles and len(bank.area) == n_views else None

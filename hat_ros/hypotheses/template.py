@@ -15,8 +15,15 @@ from numpy.typing import NDArray
 from hat_ros.config import HatConfig
 from hat_ros.errors import ConfigError
 from hat_ros.hypotheses.bank import load_or_build
-from hat_ros.hypotheses.matching import cut_placements, distinct, match_shape, whole_placement
-from hat_ros.hypotheses.scoring import Evidence, evidence, log_scores
+from hat_ros.hypotheses.matching import (
+    Placement,
+    cut_placements,
+    distinct,
+    match_shape,
+    partial_placements,
+    whole_placement,
+)
+from hat_ros.hypotheses.scoring import Evidence, Scorer, log_score, shape_score
 from hat_ros.refinement.refiner import Fit, PoseFitter, Schedule
 from hat_ros.refinement.view import MaskField, TargetViewer
 from hat_ros.target import Target
@@ -27,6 +34,10 @@ _CONTOUR_POINTS = 200
 # Robust scales as shares of the mask's longer side: how far off a coarse match is, in steps of refinement.
 _COARSE_SCALES = (0.10, 0.07, 0.05, 0.04, 0.03, 0.03)
 _MIN_SCALE_PX = 1.5
+# Before the mask's bias is known, outlines this close agree.
+_SELECTION_TOLERANCE_PX = 1.0
+# Best shape score below which the mask is taken to be incomplete.
+_POOR_SCORE = -6.0
 _FIRST = Schedule((0, 0, 0, 0), (1, 1, 1, 1), (6, 4, 3, 2))
 _LAST = Schedule((0, 4, 3.5, 3), (1, 2, 1.5, 1.5), (3, 2, 1.5, 1.5))
 
@@ -58,27 +69,30 @@ class TemplateHypotheses:
     def generate(self, frame: Frame, detection: Detection, prior: PosePrior | None) -> Candidates:
         """Up to K refined and scored poses, best first; zero rows when nothing fits."""
         field = MaskField(detection.mask)
-        starts = self._coarse(frame, field, detection)
-        if prior is not None and prior.healthy:
-            starts.insert(0, prior.T_cam_target)
-        fits = self._refine(starts, field, frame)
+        scorer = Scorer(self._viewer, frame, field, self._options.render_px)
+        starts = [prior.T_cam_target] if prior is not None and prior.healthy else []
+        poses, scores = self._align(starts + self._coarse(whole_placement(detection.mask), frame, field), frame, scorer)
+        if not poses or max(scores) < _POOR_SCORE:
+            # The mask is not the whole silhouette: look for those that it may be a part of.
+            cut = detection.touches_border()
+            placements = cut_placements(detection.mask) if cut else partial_placements(detection.mask)
+            more_poses, more_scores = self._align(self._coarse(placements, frame, field), frame, scorer)
+            poses, scores = poses + more_poses, scores + more_scores
+        fits = self._finish(self._select(poses, scores), frame, scorer)
         if not fits:
             return Candidates.none()
         T = np.stack([fit.T_cam_target for fit, _ in fits])
-        return Candidates.from_matrices(T, log_scores([e for _, e in fits]), detection.box_xyxy)
+        return Candidates.from_matrices(T, np.array([log_score(e) for _, e in fits]), detection.box_xyxy)
 
     def reset(self) -> None:
         """Nothing to forget: every keyframe stands for itself."""
 
-    def _coarse(self, frame: Frame, field: MaskField, detection: Detection) -> list[NDArray[np.float64]]:
+    def _coarse(self, placements: list[Placement], frame: Frame, field: MaskField) -> list[NDArray[np.float64]]:
         """Shape matches, pulled onto the mask's boundary."""
         options = self._options
-        placements = whole_placement(detection.mask)
-        if detection.touches_border():
-            placements += cut_placements(detection.mask)
         matches = match_shape(
             self._bank,
-            detection.mask,
+            field.mask,
             placements,
             frame.camera,
             options.n_coarse,
@@ -94,29 +108,32 @@ class TemplateHypotheses:
             poses.append(self._fitter.pull(T, self._bank.contour_m[view][used], lines[used], frame, field, scales))
         return poses
 
-    def _refine(self, starts: list[NDArray[np.float64]], field: MaskField, frame: Frame) -> list[tuple[Fit, Evidence]]:
-        """Refine on the mask, keep the K best distinct ones, refine those on the image too, gather their evidence."""
-        first = [self._fitter.fit(T, frame.camera, frame.rgb, field, (_FIRST,)) for T in starts]
-        first = self._select([fit.T_cam_target for fit in first if fit is not None], field, frame)
-        fits = []
-        for T in first:
-            fit = self._fitter.fit(T, frame.camera, frame.rgb, field, (_LAST,))
-            found = None if fit is None else evidence(self._viewer, fit, frame, field, self._options.render_px)
-            if found is not None:
-                fits.append((fit, found))
-        return fits
-
-    def _select(self, poses: list[NDArray[np.float64]], field: MaskField, frame: Frame) -> list[NDArray[np.float64]]:
-        """The K poses of best overlap that are distinct basins, best first."""
-        kept, overlaps = [], []
-        for T in poses:
-            view = self._viewer.view(T, frame.camera, self._options.render_px)
+    def _align(
+        self, starts: list[NDArray[np.float64]], frame: Frame, scorer: Scorer
+    ) -> tuple[list[NDArray[np.float64]], list[float]]:
+        """Refine on the mask with rendered contours: poses and their shape scores."""
+        poses, scores = [], []
+        for T in starts:
+            fit = self._fitter.fit(T, frame.camera, frame.rgb, scorer.field, (_FIRST,))
+            view = None if fit is None else self._viewer.view(fit.T_cam_target, frame.camera, self._options.render_px)
             if view is not None:
-                common, extra, missing = field.compare(view)
-                kept.append(T)
-                overlaps.append(common / max(common + extra + missing, 1e-9))
-        if not kept:
+                poses.append(fit.T_cam_target)
+                scores.append(shape_score(*scorer.mismatch(view, fit, _SELECTION_TOLERANCE_PX)))
+        return poses, scores
+
+    def _select(self, poses: list[NDArray[np.float64]], scores: list[float]) -> list[NDArray[np.float64]]:
+        """The K poses of best shape that are distinct basins, best first."""
+        if not poses:
             return []
-        order = np.argsort(-np.array(overlaps), kind="stable")
-        T = np.stack(kept)[order]
+        T = np.stack(poses)[np.argsort(-np.array(scores), kind="stable")]
         return list(T[distinct(T[:, :3, :3], self._max_candidates, np.radians(self._options.separation_deg))])
+
+    def _finish(self, poses: list[NDArray[np.float64]], frame: Frame, scorer: Scorer) -> list[tuple[Fit, Evidence]]:
+        """Refine on mask and image, and gather the evidence."""
+        out = []
+        for T in poses:
+            fit = self._fitter.fit(T, frame.camera, frame.rgb, scorer.field, (_LAST,))
+            evidence = None if fit is None else scorer.evidence(fit)
+            if fit is not None and evidence is not None:
+                out.append((fit, evidence))
+        return out

@@ -41,7 +41,7 @@ def contour_table(
 
 
 @njit(cache=True)
-def _count_cracks(silhouette):
+def _count_cracks(silhouette: NDArray[np.bool_]) -> int:
     h, w = silhouette.shape
     count = 0
     for y in range(1, h - 1):
@@ -55,7 +55,7 @@ def _count_cracks(silhouette):
 
 
 @njit(cache=True)
-def _free_distance(silhouette, u, v, du, dv, inside):
+def _free_distance(silhouette: NDArray[np.bool_], u: float, v: float, du: float, dv: float, inside: bool) -> int:
     """Steps of one pixel along (du, dv) that stay inside (or outside) the silhouette."""
     h, w = silhouette.shape
     for step in range(1, MAX_FREE_PX + 1):
@@ -69,7 +69,13 @@ def _free_distance(silhouette, u, v, du, dv, inside):
 
 
 @njit(cache=True)
-def _contour_table(depth_m, silhouette, blurred, K, max_points):
+def _contour_table(
+    depth_m: NDArray[np.float32],
+    silhouette: NDArray[np.bool_],
+    blurred: NDArray[np.float32],
+    K: NDArray[np.float64],
+    max_points: int,
+) -> NDArray[np.float64]:
     h, w = silhouette.shape
     total = _count_cracks(silhouette)
     stride = max(1, (total + max_points - 1) // max_points)

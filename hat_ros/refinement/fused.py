@@ -49,10 +49,7 @@ class FusedPoseRefiner:
         view = self._viewer.view(fit.T_cam_target, frame.camera, self._config.render_px)
         if covariance is None or view is None:
             return None
-        overlap = float("nan")
-        if field is not None:
-            common, extra, missing = field.compare(view)
-            overlap = common / max(common + extra + missing, 1e-9)
+        overlap = float("nan") if field is None else field.compare(view).union_share
         return Refined(lie.row_from_matrix(fit.T_cam_target), covariance, overlap, fit.support)
 
     def reset(self) -> None:

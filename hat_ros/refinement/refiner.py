@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hat_ros import lie
 from hat_ros.refinement.solver import fit_contour
-from hat_ros.refinement.view import MaskField, TargetViewer, contour_lines
+from hat_ros.refinement.view import ContourLines, MaskField, TargetViewer, contour_lines
 from hat_ros.types import Camera, Frame
 
 _NO_DISTANCE = np.zeros((2, 2), np.float32)
@@ -52,12 +52,19 @@ class Fit:
         information: (8, 8) lower triangle, of ``[dt; r; mask bias; edge bias]``.
         contour: (N, 5) as returned by the solver.
         lines: (N, 5) of the contour it belongs to.
+        mask_bias_px: how far outside the target's outline the mask's lies, as estimated.
     """
 
     T_cam_target: NDArray[np.float64]
     information: NDArray[np.float64]
     contour: NDArray[np.float64]
     lines: NDArray[np.float64]
+    mask_bias_px: float
+
+    @property
+    def outline_px(self) -> float:
+        """Length of the outline inside the image, pixels."""
+        return float(self.lines[self.contour[:, 0] > 0, 2].sum())
 
     @property
     def support(self) -> float:
@@ -111,7 +118,7 @@ class PoseFitter:
     ) -> NDArray[np.float64]:
         """Pull given contour points onto the mask's boundary, without rendering: the (4, 4) pose."""
         off = np.zeros(len(scales_px))
-        R, t, _, _ = fit_contour(
+        R, t, *_ = fit_contour(
             points_m,
             lines,
             np.ascontiguousarray(T_cam_target[:3, :3]),
@@ -128,8 +135,16 @@ class PoseFitter:
         )
         return lie.transform(R, t)
 
-    def _iterate(self, T, lines, camera, image, field, schedule: Schedule) -> Fit:
-        R, t, H, contour = fit_contour(
+    def _iterate(
+        self,
+        T: NDArray[np.float64],
+        lines: ContourLines,
+        camera: Camera,
+        image: NDArray[np.uint8],
+        field: MaskField | None,
+        schedule: Schedule,
+    ) -> Fit:
+        R, t, H, contour, mask_bias, _ = fit_contour(
             lines.points_m,
             lines.lines,
             np.ascontiguousarray(T[:3, :3]),
@@ -144,4 +159,4 @@ class PoseFitter:
             np.full(len(schedule.reach), schedule.damping),
             self.viewer.target.bounding_radius_m,
         )
-        return Fit(lie.transform(R, t), H, contour, lines.lines)
+        return Fit(lie.transform(R, t), H, contour, lines.lines, mask_bias)

@@ -9,6 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
 
 # Lines with less free target or background than this have no colour of their own to compare.
 MIN_REACH_PX = 2.0
@@ -30,7 +33,7 @@ MASK_BIAS, EDGE_BIAS = 6, 7
 
 
 @njit(cache=True)
-def cholesky_solve(A, b):
+def cholesky_solve(A: Array, b: Array) -> tuple[bool, Array]:
     """Solve the symmetric positive definite system ``A x = b`` of any small size; False when A is not."""
     n = A.shape[0]
     L = np.zeros((n, n))
@@ -60,7 +63,7 @@ def cholesky_solve(A, b):
 
 
 @njit(cache=True)
-def rotation_exp(r):
+def rotation_exp(r: Array) -> Array:
     """(3, 3) rotation of a rotation vector (Rodrigues)."""
     angle_sq = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
     if angle_sq < 1e-8:
@@ -81,7 +84,7 @@ def rotation_exp(r):
 
 
 @njit(cache=True)
-def _update_pose(R, t, step):
+def _update_pose(R: Array, t: Array, step: Array) -> tuple[Array, Array]:
     dR = rotation_exp(step[3:6])
     out = np.zeros((3, 3))
     for i in range(3):
@@ -92,7 +95,19 @@ def _update_pose(R, t, step):
 
 
 @njit(cache=True)
-def _normal_row(x, y, z, tx, ty, tz, fx, fy, nu, nv, row):
+def _normal_row(
+    x: float,
+    y: float,
+    z: float,
+    tx: float,
+    ty: float,
+    tz: float,
+    fx: float,
+    fy: float,
+    nu: float,
+    nv: float,
+    row: Array,
+) -> None:
     """Derivative of the image position along (nu, nv) with respect to the pose update, into row (6,)."""
     gx = nu * fx / z
     gy = nv * fy / z
@@ -105,7 +120,7 @@ def _normal_row(x, y, z, tx, ty, tz, fx, fy, nu, nv, row):
 
 
 @njit(cache=True)
-def _accumulate(H, g, row, weight, residual):
+def _accumulate(H: Array, g: Array, row: Array, weight: float, residual: float) -> None:
     """Add one weighted residual with derivative row to the normal equations (lower triangle)."""
     for i in range(len(row)):
         g[i] -= weight * row[i] * residual
@@ -114,7 +129,7 @@ def _accumulate(H, g, row, weight, residual):
 
 
 @njit(cache=True)
-def _damped_solve(H, g, damping, radius_m):
+def _damped_solve(H: Array, g: Array, damping: float, radius_m: float) -> tuple[bool, Array]:
     """Step of the pose and the biases; damping is a share of the mean translational information."""
     n = len(g)
     A = np.empty((n, n))
@@ -130,7 +145,7 @@ def _damped_solve(H, g, damping, radius_m):
 
 
 @njit(cache=True)
-def _mask_distance(distance, a, b, out):
+def _mask_distance(distance: NDArray[np.float32], a: float, b: float, out: Array) -> None:
     """Bilinear signed distance and its gradient at crop position (a, b), into out (3,)."""
     h, w = distance.shape
     a, b = min(max(a, 0.0), w - 1.001), min(max(b, 0.0), h - 1.001)
@@ -144,7 +159,7 @@ def _mask_distance(distance, a, b, out):
 
 
 @njit(cache=True)
-def _sample(image, u, v, out):
+def _sample(image: NDArray[np.uint8], u: float, v: float, out: Array) -> None:
     """Bilinear colour at (u, v), which must lie inside the image."""
     iu, iv = int(u), int(v)
     fu, fv = u - iu, v - iv
@@ -155,7 +170,18 @@ def _sample(image, u, v, out):
 
 
 @njit(cache=True)
-def edge_offset(image, u, v, nu, nv, reach_in, reach_out, step, profile, levels):
+def edge_offset(
+    image: NDArray[np.uint8],
+    u: float,
+    v: float,
+    nu: float,
+    nv: float,
+    reach_in: float,
+    reach_out: float,
+    step: float,
+    profile: Array,
+    levels: Array,
+) -> tuple[float, float]:
     """Where the image's own edge lies along an outward normal.
 
     The colours at both ends of the line are taken for target and background; the edge is the crossing of their half
@@ -207,13 +233,27 @@ def edge_offset(image, u, v, nu, nv, reach_in, reach_out, step, profile, levels)
 
 
 @njit(cache=True)
-def _mean_square(total, weight, floor):
+def _mean_square(total: float, weight: float, floor: float) -> float:
     """Weighted mean square residual, not below floor."""
     return max(total / weight, floor) if weight > 0.0 else floor
 
 
 @njit(cache=True)
-def fit_contour(points, lines, R, t, K, image, reaches_px, distance, origin, mask_scales_px, edge_scales_px, dampings, radius_m):
+def fit_contour(
+    points: Array,
+    lines: Array,
+    R: Array,
+    t: Array,
+    K: Array,
+    image: NDArray[np.uint8],
+    reaches_px: Array,
+    distance: NDArray[np.float32],
+    origin: Array,
+    mask_scales_px: Array,
+    edge_scales_px: Array,
+    dampings: Array,
+    radius_m: float,
+) -> tuple[Array, Array, Array, Array, float, float]:
     """Fit contour points to a mask's boundary and to the image's own edges, each weighted by its measured variance.
 
     Args:
@@ -232,7 +272,8 @@ def fit_contour(points, lines, R, t, K, image, reaches_px, distance, origin, mas
 
     Returns:
         R, t, information (8, 8) of pose, mask bias and edge bias in the last iteration, before its step, and per point
-        (N, 5): in the image (0/1), mask distance, its robust weight, edge offset, its weight (0 = no edge found).
+        (N, 5): in the image (0/1), mask distance, its robust weight, edge offset, its weight (0 = no edge found); mask
+        bias and edge bias in pixels.
     """
     n = len(points)
     row, mask_at = np.zeros(N_PARAMETERS), np.empty(3)
@@ -302,4 +343,4 @@ def fit_contour(points, lines, R, t, K, image, reaches_px, distance, origin, mas
         R, t = _update_pose(R, t, step)
         mask_bias += step[MASK_BIAS]
         edge_bias += step[EDGE_BIAS]
-    return R, t, H, state
+    return R, t, H, state, mask_bias, edge_bias

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import cv2
 import numpy as np
@@ -24,6 +23,8 @@ from hat_ros.types import Camera
 
 # Margin of the rendered crop around the target, in crop pixels: the contour needs background on both sides.
 _CROP_MARGIN_PX = 4
+# Signed distance reported beyond the field of a mask.
+_FAR_OUTSIDE_PX = 1e3
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,10 +44,19 @@ class View:
     scale: float
 
     def resample(self, image: NDArray[np.generic]) -> NDArray[np.generic]:
-        """A single-channel image seen through this crop; 0 beyond its border."""
+        """An image seen through this crop; 0 beyond its border."""
         affine = np.array([[1 / self.scale, 0, self.origin_px[0]], [0, 1 / self.scale, self.origin_px[1]]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         return cv2.warpAffine(image, affine, (self.camera.width, self.camera.height), flags=flags)
+
+    def inside(self, image_shape: tuple[int, int]) -> NDArray[np.bool_] | None:
+        """(h, w) which crop pixels lie in an image of this (height, width); None when all do."""
+        height, width = image_shape
+        x = np.arange(self.camera.width) / self.scale + self.origin_px[0]
+        y = np.arange(self.camera.height) / self.scale + self.origin_px[1]
+        if x[0] >= -0.5 and y[0] >= -0.5 and x[-1] <= width - 0.5 and y[-1] <= height - 0.5:
+            return None
+        return ((y >= -0.5) & (y <= height - 0.5))[:, None] & ((x >= -0.5) & (x <= width - 0.5))[None]
 
 
 class TargetViewer:
@@ -111,6 +121,7 @@ class MaskField:
 
     def __init__(self, mask: NDArray[np.bool_]) -> None:
         self.mask = mask
+        self.area_px = float(np.count_nonzero(mask))
         rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         self.size_px = float(max(np.ptp(rows), np.ptp(cols)) + 1)
         margin = int(max(24, 0.35 * self.size_px))
@@ -127,34 +138,48 @@ class MaskField:
         inside = cv2.distanceTransform(crop, cv2.DIST_L2, 5) - 0.5 if not crop.all() else np.full_like(outside, 1e3)
         distance = np.where(crop > 0, -inside, outside).astype(np.float32)
         self.distance = cv2.GaussianBlur(distance, (0, 0), 1.0)
+        self.inside = ((iy == np.arange(y0, y1))[:, None]) & ((ix == np.arange(x0, x1))[None])
 
-    @cached_property
-    def float_mask(self) -> NDArray[np.float32]:
-        """(H, W) float32 mask, 0 or 1."""
-        return self.mask.astype(np.float32)
+    def resample(self, view: View) -> NDArray[np.float32]:
+        """Signed distance in image pixels, seen through a view's crop; far outside beyond the field."""
+        affine = np.array(
+            [
+                [1 / view.scale, 0, view.origin_px[0] - self.origin_px[0]],
+                [0, 1 / view.scale, view.origin_px[1] - self.origin_px[1]],
+            ]
+        )
+        size = (view.camera.width, view.camera.height)
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        return cv2.warpAffine(self.distance, affine, size, flags=flags, borderValue=_FAR_OUTSIDE_PX)
 
-    @cached_property
-    def _ones(self) -> NDArray[np.float32]:
-        return np.ones(self.mask.shape, np.float32)
-
-    @cached_property
-    def area_px(self) -> float:
-        """Mask pixels."""
-        return float(np.count_nonzero(self.mask))
-
-    def compare(self, view: View) -> tuple[float, float, float]:
-        """Areas in image pixels, inside the image only: common, mask without silhouette, silhouette without mask."""
-        seen = view.resample(self.float_mask)
+    def compare(self, view: View) -> Overlap:
+        """Areas of agreement and disagreement with a rendered silhouette."""
+        seen = self.resample(view)
         silhouette = view.rendering.mask
-        if (
-            view.origin_px.min() < 0
-            or (
-                np.array([view.camera.width, view.camera.height]) / view.scale + view.origin_px
-                > np.array(self.mask.shape[::-1]) - 1
-            ).any()
-        ):
-            silhouette = silhouette & (view.resample(self._ones) > 0.5)
+        inside = view.inside(self.mask.shape)
+        if inside is not None:
+            silhouette = silhouette & inside
         unit = 1.0 / view.scale**2
-        common = float(np.minimum(seen, silhouette).sum()) * unit
+        common = float(np.count_nonzero(silhouette & (seen < 0))) * unit
         missing = float(np.count_nonzero(silhouette)) * unit - common
-        return common, max(self.area_px - common, 0.0), max(missing, 0.0)
+        return Overlap(common, max(self.area_px - common, 0.0), missing)
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """Areas in pixels of the image, inside the image only.
+
+    Attributes:
+        common: mask and silhouette.
+        extra: mask without silhouette.
+        missing: silhouette without mask.
+    """
+
+    common: float
+    extra: float
+    missing: float
+
+    @property
+    def union_share(self) -> float:
+        """Intersection over union."""
+        return self.common / max(self.common + self.extra + self.missing, 1e-9)

@@ -1,0 +1,64 @@
+import numpy as np
+import pytest
+from shape_scene import spacecraft
+
+from hat_ros import lie
+from hat_ros.cache import cache_folder
+from hat_ros.hypotheses import bank
+from hat_ros.render import create_renderer
+
+
+@pytest.fixture(scope="module")
+def target():
+    return spacecraft()
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+
+
+@pytest.mark.parametrize("n_views", [162, 642, 2562])
+def test_views_cover_the_sphere_evenly(n_views):
+    R = bank.view_rotations(n_views)
+    assert R.shape == (n_views, 3, 3)
+    assert lie.is_rigid(lie.transform(R, np.zeros((n_views, 3)))).all()
+    directions = -R[:, 2]
+    cosines = directions @ directions.T - 2 * np.eye(n_views)
+    nearest_deg = np.degrees(np.arccos(np.clip(cosines.max(axis=1), -1, 1)))
+    assert nearest_deg.max() < 1.4 * nearest_deg.min()
+
+
+def test_a_damaged_cache_is_built_again(target):
+    renderer = create_renderer("embree", target)
+    first = bank.load_or_build(target, renderer, 162, 24)
+    spectrum = np.array(first.spectrum)
+    file = next(cache_folder().rglob("spectrum.npy"))
+    content = bytearray(file.read_bytes())
+    content[-9] ^= 255
+    file.write_bytes(content)
+    again = bank.load_or_build(target, renderer, 162, 24)
+    assert again.spectrum.tobytes() == spectrum.tobytes()
+    assert again.n_angles == 24
+
+
+def test_a_read_only_cache_is_no_error(target, tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert bank.load_or_build(target, create_renderer("embree", target), 162, 24).area.shape == (162,)
+
+
+def test_contour_points_lie_on_the_target(target):
+    views = bank.build(target, create_renderer("embree", target), 162, 24)
+    used = views.contour_weight > 0
+    points = views.contour_m[used]
+    low, high = target.vertices_m.min(axis=0), target.vertices_m.max(axis=0)
+    assert (points > low - 0.05).all() and (points < high + 0.05).all()
+    assert used.sum(axis=1).min() > 20
+
+
+def test_moments_of_a_disc():
+    y, x = np.mgrid[:100, :120]
+    center, gyration = bank.mask_moments((x - 60) ** 2 + (y - 45) ** 2 <= 30**2)
+    np.testing.assert_allclose(center, [60, 45], atol=1e-6)
+    assert gyration == pytest.approx(30 / np.sqrt(2), rel=0.01)

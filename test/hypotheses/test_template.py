@@ -1,0 +1,126 @@
+import cv2
+import numpy as np
+import pytest
+from shape_scene import CAMERA, picture, pose_errors, random_pose, spacecraft
+
+from hat_ros import lie
+from hat_ros.config import HatConfig, HypothesesConfig, TemplateConfig
+from hat_ros.errors import ConfigError
+from hat_ros.hypotheses.stage import HypothesisStage
+from hat_ros.hypotheses.template import TemplateHypotheses
+from hat_ros.types import Detection, Frame, PosePrior
+
+
+@pytest.fixture(scope="module")
+def target():
+    return spacecraft()
+
+
+@pytest.fixture(scope="module")
+def backend(target, tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield TemplateHypotheses(HatConfig(), target)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_rendered_view_is_found_again_from_any_angle(backend, target, seed):
+    T_true = random_pose(np.random.default_rng(seed), target)
+    frame, mask = picture(target, T_true)
+    candidates = backend.generate(frame, Detection(mask), None)
+    assert 1 <= len(candidates) <= 10
+    turn, shift = pose_errors(candidates.T_cam_target, T_true)
+    assert turn[0] < 1.5
+    assert shift[0] < 0.01
+    assert (np.diff(candidates.log_score) <= 0).all()
+
+
+def test_candidates_are_distinct_basins(backend, target):
+    frame, mask = picture(target, random_pose(np.random.default_rng(11), target))
+    R = backend.generate(frame, Detection(mask), None).T_cam_target[:, :3, :3]
+    angles = np.degrees(lie.angle_between(R[:, None], R[None]))[np.triu_indices(len(R), 1)]
+    assert len(R) > 3
+    assert np.median(angles) > 15
+
+
+def test_a_mask_two_pixels_too_large_costs_neither_basin_nor_range(backend, target):
+    T_true = random_pose(np.random.default_rng(3), target)
+    frame, mask = picture(target, T_true)
+    large = cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    turn, shift = pose_errors(backend.generate(frame, Detection(large), None).T_cam_target, T_true)
+    assert turn[0] < 3
+    assert shift[0] < 0.02
+
+
+@pytest.mark.parametrize("seed", [1, 2, 5])
+def test_a_target_cut_by_the_border_is_among_the_candidates(backend, target, seed):
+    rng = np.random.default_rng(seed)
+    T_true = random_pose(rng, target, range_m=(5.0, 5.5))
+    T_true[0, 3] += 1.35
+    frame, mask = picture(target, T_true)
+    assert Detection(mask).touches_border()
+    turn, shift = pose_errors(backend.generate(frame, Detection(mask), None).T_cam_target, T_true)
+    best = np.argmin(turn)
+    assert turn[best] < 10
+    assert shift[best] < 0.1
+
+
+def test_a_box_gives_the_truth_among_the_candidates(backend, target):
+    T_true = random_pose(np.random.default_rng(4), target)
+    frame, mask = picture(target, T_true)
+    box = np.zeros_like(mask)
+    rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    box[rows[0] - 3 : rows[-1] + 4, cols[0] - 3 : cols[-1] + 4] = True
+    turn, _ = pose_errors(backend.generate(frame, Detection(box, silhouette=False), None).T_cam_target, T_true)
+    assert turn.min() < 10
+
+
+def test_a_healthy_prior_is_a_candidate(backend, target):
+    T_true = random_pose(np.random.default_rng(8), target)
+    frame, mask = picture(target, T_true)
+    row = lie.row_from_matrix(T_true)
+    prior = PosePrior(0, row, row, healthy=True)
+    turn, _ = pose_errors(backend.generate(frame, Detection(mask), prior).T_cam_target, T_true)
+    assert turn.min() < 1
+
+
+@pytest.mark.parametrize("level", [0, 255])
+def test_a_blank_image_with_a_box_gives_nothing(backend, level):
+    frame = Frame(1, np.full((CAMERA.height, CAMERA.width, 3), level, np.uint8), CAMERA)
+    box = np.zeros((CAMERA.height, CAMERA.width), bool)
+    box[60:180, 80:240] = True
+    assert len(backend.generate(frame, Detection(box, silhouette=False), None)) == 0
+
+
+def test_a_mask_of_one_pixel_is_no_error(backend):
+    frame = Frame(1, np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8), CAMERA)
+    mask = np.zeros((CAMERA.height, CAMERA.width), bool)
+    mask[100, 100] = True
+    assert np.isfinite(backend.generate(frame, Detection(mask), None).pose_rows).all()
+
+
+def test_the_same_image_gives_the_same_bytes(backend, target, tmp_path, monkeypatch):
+    frame, mask = picture(target, random_pose(np.random.default_rng(9), target))
+    first = backend.generate(frame, Detection(mask), None)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    second = TemplateHypotheses(HatConfig(), target).generate(frame, Detection(mask), None)
+    assert first.pose_rows.tobytes() == second.pose_rows.tobytes()
+    assert first.log_score.tobytes() == second.log_score.tobytes()
+
+
+def test_the_stage_asks_at_keyframes_only(target, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    config = HatConfig(hypotheses=HypothesesConfig(max_candidates=3, template=TemplateConfig(n_views=162, n_coarse=6)))
+    stage = HypothesisStage(config, target)
+    frame, mask = picture(target, random_pose(np.random.default_rng(1), target))
+    assert len(stage.update(frame, None, None)) == 0
+    assert 1 <= len(stage.update(frame, Detection(mask), None)) <= 3
+    assert len(stage.update(frame, Detection(mask), None)) == 0
+    stage.reset()
+    assert len(stage.update(frame, Detection(mask), None)) >= 1
+
+
+@pytest.mark.parametrize("options", [{"n_views": 500}, {"n_angles": 71}])
+def test_impossible_banks_are_refused(target, options):
+    with pytest.raises(ConfigError, match=next(iter(options))):
+        TemplateHypotheses(HatConfig(hypotheses=HypothesesConfig(template=TemplateConfig(**options))), target)

@@ -1,0 +1,123 @@
+import cv2
+import numpy as np
+import pytest
+from shape_scene import CAMERA, picture, pose_errors, random_pose, spacecraft
+
+from hat_ros import lie
+from hat_ros.config import HatConfig, RefinementConfig
+from hat_ros.refinement import create_refiner
+from hat_ros.types import Detection, Frame
+
+ENABLED = HatConfig(refinement=RefinementConfig(enabled=True))
+
+
+@pytest.fixture(scope="module")
+def target():
+    return spacecraft()
+
+
+@pytest.fixture(scope="module")
+def refiner(target):
+    return create_refiner(ENABLED, target)
+
+
+def perturbed(T, rng, angle_deg, shift):
+    axis = rng.normal(size=3)
+    out = T.copy()
+    out[:3, :3] = lie.so3_exp(np.radians(angle_deg) * axis / np.linalg.norm(axis)) @ T[:3, :3]
+    out[:3, 3] *= 1 + rng.uniform(-shift, shift)
+    return out
+
+
+def test_there_is_none_when_it_is_switched_off(target):
+    assert create_refiner(HatConfig(refinement=RefinementConfig(enabled=False)), target) is None
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_perturbed_pose_converges(refiner, target, seed):
+    rng = np.random.default_rng(seed)
+    T_true = random_pose(rng, target)
+    frame, mask = picture(target, T_true)
+    refined = refiner.refine(frame, Detection(mask), perturbed(T_true, rng, 4.0, 0.03))
+    turn, shift = pose_errors(refined.T_cam_target, T_true)
+    assert turn < 1.0
+    assert shift < 0.005
+    assert refined.overlap > 0.93
+    assert refined.support > 0.9
+
+
+@pytest.mark.parametrize("background", [0, 120])
+def test_the_image_alone_is_enough_for_a_small_correction(refiner, target, background):
+    rng = np.random.default_rng(21)
+    T_true = random_pose(rng, target)
+    frame, _ = picture(target, T_true, background=background)
+    refined = refiner.refine(frame, None, perturbed(T_true, rng, 2.0, 0.02))
+    turn, shift = pose_errors(refined.T_cam_target, T_true)
+    assert turn < 1.5
+    assert shift < 0.01
+    assert np.isnan(refined.overlap)
+
+
+@pytest.mark.parametrize("size", [3, 5])
+def test_the_outline_bias_of_a_mask_does_not_move_the_pose(refiner, target, size):
+    rng = np.random.default_rng(5)
+    T_true = random_pose(rng, target)
+    frame, mask = picture(target, T_true)
+    large = cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
+    refined = refiner.refine(frame, Detection(large), perturbed(T_true, rng, 1.0, 0.01))
+    assert pose_errors(refined.T_cam_target, T_true)[1] < 0.006
+
+
+def test_a_target_leaving_the_image_is_still_refined(refiner, target):
+    rng = np.random.default_rng(7)
+    T_true = random_pose(rng, target, range_m=(5.0, 5.2))
+    T_true[0, 3] += 1.3
+    frame, mask = picture(target, T_true)
+    assert Detection(mask).touches_border()
+    refined = refiner.refine(frame, Detection(mask), perturbed(T_true, rng, 2.0, 0.01))
+    turn, shift = pose_errors(refined.T_cam_target, T_true)
+    assert turn < 2
+    assert shift < 0.01
+
+
+def test_a_pose_of_another_basin_is_never_turned_into_this_one(refiner, target):
+    rng = np.random.default_rng(8)
+    T_true = random_pose(rng, target)
+    frame, mask = picture(target, T_true)
+    refined = refiner.refine(frame, Detection(mask), perturbed(T_true, rng, 60.0, 0.0))
+    if refined is not None:
+        assert 45 < pose_errors(refined.T_cam_target, T_true)[0] < 75
+
+
+@pytest.mark.parametrize("level", [0, 255])
+def test_a_blank_image_refines_nothing(refiner, target, level):
+    frame = Frame(1, np.full((CAMERA.height, CAMERA.width, 3), level, np.uint8), CAMERA)
+    assert refiner.refine(frame, None, random_pose(np.random.default_rng(0), target)) is None
+
+
+def test_a_pose_behind_the_camera_is_no_error(refiner, target):
+    frame, mask = picture(target, random_pose(np.random.default_rng(0), target))
+    behind = lie.transform(np.eye(3), np.array([0.0, 0.0, -5.0]))
+    assert refiner.refine(frame, Detection(mask), behind) is None
+
+
+def test_the_covariance_is_symmetric_positive_and_grows_with_range(refiner, target):
+    sigmas = []
+    for range_m in (6.0, 14.0):
+        T_true = random_pose(np.random.default_rng(12), target, range_m=(range_m, range_m + 0.01))
+        frame, mask = picture(target, T_true)
+        covariance = refiner.refine(frame, Detection(mask), T_true).covariance
+        np.testing.assert_allclose(covariance, covariance.T, rtol=1e-9, atol=1e-18)
+        assert np.linalg.eigvalsh(covariance).min() > 0
+        sigmas.append(np.sqrt(np.trace(covariance[:3, :3])))
+    assert sigmas[1] > sigmas[0]
+
+
+def test_the_same_image_gives_the_same_bytes(target):
+    rng = np.random.default_rng(3)
+    T_true = random_pose(rng, target)
+    frame, mask = picture(target, T_true)
+    start = perturbed(T_true, rng, 2.0, 0.01)
+    first, second = (create_refiner(ENABLED, target).refine(frame, Detection(mask), start) for _ in range(2))
+    assert first.pose_row.tobytes() == second.pose_row.tobytes()
+    assert first.covariance.tobytes() == second.covariance.tobytes()
