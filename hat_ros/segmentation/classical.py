@@ -33,12 +33,13 @@ _MIN_CONTINUITY = 0.6  # overlap of a tracked mask with its seed
 _MIN_CONTRAST = 8.0  # 8-bit colour step across the outline below which there is no outline
 _MIN_CONTRAST_KEPT = 0.4  # share of its usual contrast at which a tracked outline is lost
 _CONTRAST_GAIN = 0.2
-_AGREEMENT = 0.8  # overlap of two independent masks that mean the same
+_AGREEMENT = 0.8  # overlap of two independent masks that mean the same target
+_SAME = 0.95  # overlap of two masks that are the same
 _CLEARLY_BETTER = 0.025  # shape overlap by which one explanation must beat the simpler one
 _SECOND_REGION_SHARE = 0.2  # a second bright region this large makes the choice between them a question
 _SCATTERED_GAIN = 0.1  # shape overlap that bridging the gaps between lit parts must bring
 _MAX_RETRY_FRAMES = 8
-_CHECK_UNAIDED_FRAMES = 3  # frames between checks of a mask that no prior holds in place
+_CHECK_UNAIDED_FRAMES = 3  # between checks of a mask that no prior holds in place; more while they find the same
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,7 @@ class ClassicalSegmenter:
         self._models = region.ColorModels()
         self._contrast = 0.0  # of the tracked outline, slowly following
         self._since_check = 0
+        self._check_every = _CHECK_UNAIDED_FRAMES
         self._failures = 0
         self._wait = 0
 
@@ -178,8 +180,8 @@ class ClassicalSegmenter:
         if self._mask is not None:
             tracked, aided = self._track(frame, prior)
             self._since_check += 1
-            interval = self._config.check_interval_frames if aided else _CHECK_UNAIDED_FRAMES
-            if tracked is not None and self._since_check < interval:
+            due = self._since_check >= (self._config.check_interval_frames if aided else self._check_every)
+            if tracked is not None and not due:
                 return tracked
             if tracked is not None:
                 self._since_check = 0
@@ -256,7 +258,10 @@ class ClassicalSegmenter:
         A mask held in place by a prediction is given up only for one that means something else.
         """
         found = self._search(frame, _touched_sides(tracked))
-        if found is not None and aided and _overlap(found.mask, tracked) >= _AGREEMENT:
+        agreement = 0.0 if found is None else _overlap(found.mask, tracked)
+        longer = min(2 * self._check_every, self._config.check_interval_frames)
+        self._check_every = longer if agreement >= _SAME else _CHECK_UNAIDED_FRAMES
+        if aided and agreement >= _AGREEMENT:
             return tracked
         shape = self._bank.overlap(_shrink(tracked))
         if found is not None and found.shape_overlap > shape + (_CLEARLY_BETTER if aided else 0.0):

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-# A sky pixel is at most this bright (8-bit luma); black level and noise of real cameras stay below.
-_SKY_MAX = 40
+# A sky pixel is at most this bright (8-bit, any channel); black level and noise of real cameras stay below.
+_SKY_MAX = 48
 _RING_PX = 8  # width of the image border that is looked at for the sky
 _NOISE_SIGMAS = 5.0
 _MIN_STEP = 1.5  # smallest excess over the sky that counts, for noise-free images
@@ -62,15 +62,17 @@ def measure_sky(rgb: NDArray[np.uint8]) -> Sky:
     mean3 = cv2.boxFilter(luma, cv2.CV_32F, (3, 3))
     r = min(_RING_PX, min(luma.shape) // 4)
     # Every other row and column of the border: neighbours share pixels of their means anyway.
-    strips = mean3[1:r:2, ::2], mean3[-r:-1:2, ::2], mean3[r:-r:2, 1:r:2], mean3[r:-r:2, -r:-1:2]
-    ring = np.concatenate([strip.ravel() for strip in strips])
-    dark = ring[ring < _SKY_MAX]
-    if not dark.size:
+    strips = np.s_[1:r:2, ::2], np.s_[-r:-1:2, ::2], np.s_[r:-r:2, 1:r:2], np.s_[r:-r:2, -r:-1:2]
+    ring = np.concatenate([mean3[strip].ravel() for strip in strips])
+    # Black in every channel: a dark sea is blue.
+    brightest = np.concatenate([rgb[strip].max(axis=2).ravel() for strip in strips])
+    dark = ring[brightest < _SKY_MAX]
+    if dark.size < 8:
         return Sky(luma, mean3, 0.0, 0.0, 0.0)
     level = float(np.median(dark))
     sigma = 1.4826 * float(np.median(np.abs(dark - level)))
     threshold = level + max(_NOISE_SIGMAS * sigma, _MIN_STEP)
-    return Sky(luma, mean3, level, threshold, float(np.count_nonzero(ring <= threshold)) / ring.size)
+    return Sky(luma, mean3, level, threshold, float(np.count_nonzero(dark <= threshold)) / ring.size)
 
 
 def lit_regions(sky: Sky) -> list[NDArray[np.uint8]]:
