@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from hat_ros.config import HatConfig
 from hat_ros.errors import ConfigError
 from hat_ros.hypotheses.bank import load_or_build
+from hat_ros.hypotheses.box import silhouette_in_box
 from hat_ros.hypotheses.matching import (
     Placement,
     cut_placements,
@@ -68,14 +69,17 @@ class TemplateHypotheses:
 
     def generate(self, frame: Frame, detection: Detection, prior: PosePrior | None) -> Candidates:
         """Up to K refined and scored poses, best first; zero rows when nothing fits."""
-        field = MaskField(detection.mask)
+        mask = detection.mask if detection.silhouette else silhouette_in_box(frame.rgb, detection.mask)
+        if mask is None:
+            return Candidates.none()
+        field = MaskField(mask)
         scorer = Scorer(self._viewer, frame, field, self._options.render_px)
         starts = [prior.T_cam_target] if prior is not None and prior.healthy else []
-        poses, scores = self._align(starts + self._coarse(whole_placement(detection.mask), frame, field), frame, scorer)
+        poses, scores = self._align(starts + self._coarse(whole_placement(mask), frame, field), frame, scorer)
         if not poses or max(scores) < _POOR_SCORE:
             # The mask is not the whole silhouette: look for those that it may be a part of.
             cut = detection.touches_border()
-            placements = cut_placements(detection.mask) if cut else partial_placements(detection.mask)
+            placements = cut_placements(mask) if cut else partial_placements(mask)
             more_poses, more_scores = self._align(self._coarse(placements, frame, field), frame, scorer)
             poses, scores = poses + more_poses, scores + more_scores
         fits = self._finish(self._select(poses, scores), frame, scorer)
