@@ -30,6 +30,8 @@ from hat_ros.nodes.params import declare_parameters
 from hat_ros.nodes.wire import Wire, message_class
 
 OK, WARN, ERROR = 0, 1, 2
+# Ends the sentence of a stage timeout, so that whoever started the node can tell it from other failures.
+HANGS = "a stage does not answer"
 _ACK_TIMEOUT_S = 10.0
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 

@@ -25,7 +25,7 @@ import yaml
 from numpy.typing import NDArray
 from rclpy.executors import SingleThreadedExecutor
 
-from hat_ros.bag import TYPESTORE
+from hat_ros.bag import TYPESTORE, BagReader
 from hat_ros.config import HatConfig, config_to_dict
 from hat_ros.errors import ConfigError, HatError, InputError, RunError, StageTimeoutError
 from hat_ros.nodes import base, topics
@@ -126,6 +126,7 @@ def replay(
         raise ConfigError(f"graph must be 'processes' or 'single', found '{graph}'")
     if credits is not None:
         config = replace(config, graph=replace(config.graph, credits_replay=credits))
+    reader = BagReader(bag, image_topic=image_topic, camera_info_topic=camera_info_topic)
     prepare_environment()
     with tempfile.TemporaryDirectory(prefix="hat_replay_") as scratch, _free_domain(domain_id) as domain:
         folder = Path(scratch)
@@ -133,15 +134,15 @@ def replay(
         config_file.write_text(yaml.safe_dump(config_to_dict(config), sort_keys=False), encoding="utf-8")
         common = {"config": str(config_file), "target": str(Path(target).resolve()), "live": live, "recorded": True}
         play = {
-            "bag": str(Path(bag).resolve()),
-            "image_topic": image_topic or "",
-            "camera_info_topic": camera_info_topic or "",
+            "bag": str(reader.path.resolve()),
+            "image_topic": reader.image_topic,
+            "camera_info_topic": reader.camera_info_topic,
             "rate": float(rate),
             "first_frame": first_frame,
             "max_frames": max_frames or 0,
             "wait_for": [*STAGES, "recorder"],
         }
-        run = _Run(domain, folder, common, play, Path(out).resolve(), on_progress)
+        run = _Run(domain, folder, common, play, reader, Path(out).resolve(), on_progress)
         with contextlib.closing(run):
             run.start_nodes(graph, stage_delays_ms or {})
             return run.run()
@@ -156,11 +157,12 @@ class _Run:
         folder: Path,
         common: dict[str, Any],
         play: dict[str, Any],
+        reader: BagReader,
         out: Path,
         on_progress: Callable[[Progress], None] | None,
     ) -> None:
         self._domain, self._folder, self._common, self._play = domain, folder, common, play
-        self._out, self._on_progress = out, on_progress
+        self._reader, self._out, self._on_progress = reader, out, on_progress
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._logs: list[IO[bytes]] = []
         self._context = rclpy.Context()
@@ -183,7 +185,6 @@ class _Run:
         modules = {name: f"{name}_node" for name in STAGES} if graph == "processes" else {"graph": "single"}
         for name, module in modules.items():
             self._start(name, module, parameters)
-        # The recorder first: the result bag exists before anything can fail, and the player checks the input bag.
         self._recorder = RecorderNode(context=self._context, parameters={**self._common, "out": str(self._out)})
         self._add(self._recorder)
         self._player = PlayerNode(context=self._context, parameters={**self._common, **self._play, "recorded": False})
@@ -253,6 +254,8 @@ class _Run:
         said = next((line.strip() for line in reversed(lines) if line.strip()), "no last words")
         if code == InputError.exit_code:
             return InputError(said)
+        if said.endswith(base.HANGS):
+            return StageTimeoutError(f"{said.removesuffix(base.HANGS)}{self._culprit()}")
         how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
         return RunError(f"node '{name}' {how} after {self._player.n_status} frames: {said}")
 
@@ -295,7 +298,7 @@ class _Run:
         for log in self._logs:
             log.close()
         try:
-            if len(self._nodes) == 2:
+            if self._nodes:
                 self._record_truth()
         finally:
             base.close(self._executor, self._nodes)
@@ -303,11 +306,11 @@ class _Run:
 
     def _record_truth(self) -> None:
         """The truth goes from the bag into the record, past every node."""
-        sent = self._player.sent_s
-        bag, make = self._player.bag, Wire.bag(TYPESTORE)
-        for stamp_ns, row in sorted(bag.truth_rows().items()):
-            if sent and min(sent) <= stamp_ns <= max(sent):
-                message = make.pose(stamp_ns, bag.frame_id, row)
+        first, last = self._recorder.span_ns
+        make = Wire.bag(TYPESTORE)
+        for stamp_ns, row in sorted(self._reader.truth_rows().items()):
+            if first <= stamp_ns <= last:
+                message = make.pose(stamp_ns, self._reader.frame_id, row)
                 self._recorder.writer.write_message(topics.GROUND_TRUTH, message, stamp_ns)
 
 

@@ -10,14 +10,16 @@ import difflib
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 
 from hat_ros.config import HatConfig, config_from_dict, config_to_dict, flat_options, load_config
 from hat_ros.errors import ConfigError
-from hat_ros.target import Target, load_target
+
+if TYPE_CHECKING:
+    from hat_ros.target import Target
 
 _RUN_OPTIONS: dict[str, tuple[Any, str]] = {
     "config": ("default", "preset (default, mega_hat, ...) or YAML file; other parameters override it"),
@@ -68,6 +70,8 @@ class Settings:
             ConfigError: the parameter is empty.
             MeshError: the model is unusable.
         """
+        from hat_ros.target import load_target  # seconds of imports that not every node needs
+
         if not self.target:
             raise ConfigError("parameter 'target' is empty: give the CAD model or target.yaml, -p target:=FILE")
         return load_target(self.target)

@@ -18,6 +18,7 @@ class RecorderNode(base.HatNode):
     Attributes:
         counts: messages recorded by topic.
         newest_ns: stamp of the last message by topic.
+        span_ns: stamps of the first and last admitted frame; nothing lies between (0, -1).
         writer: the result bag, open until :meth:`release`.
     """
 
@@ -32,6 +33,7 @@ class RecorderNode(base.HatNode):
             raise ConfigError("parameter 'out' is empty: give the folder of the bag to write, -p out:=FOLDER")
         self.counts = dict.fromkeys(topics.RECORDED, 0)
         self.newest_ns = dict.fromkeys(topics.RECORDED, 0)
+        self.span_ns = (0, -1)
         self.writer = BagWriter(Path(out))
         for topic in topics.RECORDED:
             profile = qos.RECORDER_LATCH if qos.is_latched(topic) else qos.RECORDER
@@ -56,6 +58,8 @@ class RecorderNode(base.HatNode):
         stamp_ns = self.newest_ns[topics.ADMISSION] if clocked else stamp_of_cdr(data, self.writer.path)
         self.writer.write_cdr(topic, topics.TYPES[topic], data, stamp_ns)
         self.counts[topic] += 1
+        if topic == topics.ADMISSION:
+            self.span_ns = (self.span_ns[0] if self.counts[topic] > 1 else stamp_ns, stamp_ns)
         self.newest_ns[topic] = max(self.newest_ns[topic], stamp_ns)
 
 

@@ -37,7 +37,7 @@ class SegmentationNode(base.HatNode):
         self.admission = Admission(1 if live else config.graph.credits_replay)
         self.dropped_total = self.epoch = 0
         self._camera: Camera | None = None
-        self._camera_is_new = self._is_open = False
+        self._camera_is_new = self._is_open = self._warm = False
         self._ready_nodes: set[str] = set()
         self._queue: deque[tuple[int, Any]] = deque()
         self._masks: dict[int, Any] | None = {} if config.segmentation.backend == "annotated" else None
@@ -106,6 +106,7 @@ class SegmentationNode(base.HatNode):
         self.priors.push(estimate)
         if self.admission.answered(estimate.stamp_ns):
             del self._entered_s[estimate.stamp_ns]
+            self._warm = True
             self.report(base.OK, "running")
         self._pump()
 
@@ -157,13 +158,14 @@ class SegmentationNode(base.HatNode):
     def _check_time(self) -> None:
         """A stage that does not answer: a replay ends, a live graph goes on in a new epoch."""
         oldest = min(self._entered_s, key=self._entered_s.get, default=None)
-        limit_s = self.settings.config.graph.stage_timeout_s
+        graph = self.settings.config.graph
+        limit_s = graph.stage_timeout_s if self._warm else graph.startup_timeout_s  # the first frame compiles code
         if oldest is not None and time.monotonic() - self._entered_s[oldest] > limit_s:
             self.admission.give_up()
             self._entered_s.clear()
             self._new_epoch()
             self._is_open = False
-            self.fail(StageTimeoutError(f"no status for frame {oldest} within {limit_s:g} s: a stage does not answer"))
+            self.fail(StageTimeoutError(f"no status for frame {oldest} within {limit_s:g} s: {base.HANGS}"))
         self._pump()
 
     def _new_epoch(self) -> None:

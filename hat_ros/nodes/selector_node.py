@@ -15,6 +15,7 @@ class SelectorNode(StageNode):
 
     NAME = "selector"
     JOINED = (topics.HYPOTHESES_SCORED, topics.SLAM_STATE)
+    NEEDS_TARGET = False
 
     def configure(self) -> None:
         """Build the stage and its endpoints."""

@@ -5,14 +5,16 @@ from __future__ import annotations
 import random
 import time
 from functools import partial
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from hat_ros.core.prior import PriorBuffer
 from hat_ros.core.sync import ExactJoin
 from hat_ros.nodes import topics, wire
 from hat_ros.nodes.base import WARN, HatNode
-from hat_ros.target import Target
 from hat_ros.types import Camera, Detection, Frame, PosePrior
+
+if TYPE_CHECKING:
+    from hat_ros.target import Target
 
 
 class ExtraDelay:
@@ -32,21 +34,22 @@ class StageNode(HatNode):
     """Owns one stage object; :attr:`JOINED` are the topics that it needs of every frame, beside the admission.
 
     Attributes:
-        target: the CAD model.
+        target: the CAD model, None for a stage that needs none.
         stage: the stage object, with ``reset()``.
         priors: fused poses of the past, fed from ``/hat/status``.
     """
 
     JOINED: ClassVar[tuple[str, ...]]
     USES_PRIOR: ClassVar[bool] = False
+    NEEDS_TARGET: ClassVar[bool] = True
 
-    target: Target
+    target: Target | None
     stage: Any
     _join: ExactJoin | None = None
 
     def configure(self) -> None:
         """Build the stage and subscribe to its inputs."""
-        self.target = self.settings.load_target()
+        self.target = self.settings.load_target() if self.NEEDS_TARGET else None
         self.stage = self.create_stage()
         self.priors = PriorBuffer(self.settings.config.prior)
         self.cameras: list[tuple[int, Camera]] = []
@@ -75,7 +78,7 @@ class StageNode(HatNode):
 
     def cleanup(self) -> None:
         """Drop the stage."""
-        del self.stage, self.target
+        self.stage = self.target = None
         self._join = None
 
     def values(self) -> dict[str, Any]:
