@@ -160,7 +160,9 @@ class DroidConfig:
         "let these updates move the depths of the last two keyframes too; helps where new surface turns into view",
     )
     as_released: bool = option(
-        True, "keep two slips of the released tracker (depth back-substitution, context of the first frame)"
+        True,
+        "like the released tracker: back-substitution without the first pose, context of the first frame, one fixed "
+        "pose; false corrects the first two and holds the scale with a second one",
     )
     backend_threshold: float = option(22.0, "offline only: largest frame distance of a global edge", low=0)
     backend_radius: int = option(2, "offline only: neighbours in time that are always connected, less one", low=1)

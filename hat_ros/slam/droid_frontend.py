@@ -136,6 +136,9 @@ class DroidFrontend:
             graph.update(1, use_inactive=True)
         self.keyframes.predict_next(config.motion_damping)
         self.initialised = True
+        if not config.as_released:
+            # One fixed pose leaves the scale free to wander from keyframe to keyframe; two hold it.
+            graph.n_fixed = 2
         graph.drop(graph.ii < n - _INITIAL_TAIL, retire=True)
 
     def _update(self) -> None:

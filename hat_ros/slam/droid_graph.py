@@ -121,6 +121,9 @@ class FactorGraph:
         stored: keep the correlation volumes instead of forming them at every update.
         rule: variant of the bundle adjustment.
         inactive_margin: how many frames before the first free pose retired edges may reach.
+
+    Attributes:
+        n_fixed: poses that never move, at the old end.
     """
 
     def __init__(
@@ -133,7 +136,7 @@ class FactorGraph:
         rule: BundleRule = PUBLISHED_RULE,
         inactive_margin: int = INACTIVE_MARGIN,
     ) -> None:
-        self.inactive_margin = inactive_margin
+        self.inactive_margin, self.n_fixed = inactive_margin, 1
         self.model, self.keyframes = model, keyframes
         self.max_factors, self.stored, self.rule = max_factors, stored, rule
         h, w = keyframes.shape
@@ -229,13 +232,14 @@ class FactorGraph:
         """Forget the oldest keyframes; none of them may have an active edge."""
         self._drop_inactive((self.ii_inactive < count) | (self.jj_inactive < count))
         self._renumber(lambda frames: frames - count)
+        self.n_fixed = max(self.n_fixed - count, 1)
         self.keyframes.retire(count)
 
     def oldest_needed(self) -> int:
         """Oldest keyframe that an active edge, or bundle adjustment over them, may still touch."""
         if not len(self):
             return len(self.keyframes)
-        first_free = max(1, int(self.ii.min()) + 1)
+        first_free = max(self.n_fixed, int(self.ii.min()) + 1)
         return max(min(int(self.ii.min()), int(self.jj.min()), first_free - self.inactive_margin), 0)
 
     def update(
@@ -281,7 +285,7 @@ class FactorGraph:
     def _planned(self, first: int | None, use_inactive: bool) -> _UpdatePlan:
         """Index tensors of an update, made once per change of the graph."""
         if first is None:
-            first = max(1, int(self.ii.min()) + 1)
+            first = max(self.n_fixed, int(self.ii.min()) + 1)
         if self._plan is not None and (self._plan.first, self._plan.use_inactive) == (first, use_inactive):
             return self._plan
         oldest = first - self.inactive_margin
