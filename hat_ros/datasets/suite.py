@@ -71,11 +71,11 @@ _YCBV = ClipSpec(
 DEMO = Clip(
     "observer",
     ClipSpec(
-        frames=200, focal_px=1000.0, range_m=(11.0, 6.5), drift=0.3, start_rotvec=(1.1, 0.7, -0.6),
+        frames=200, focal_px=1000.0, range_m=(11.0, 6.5), drift=0.3, start_rotvec=(1.45, 0.39, -0.06),
         spin_axis=(0.25, 0.15, 1.0), spin_deg_per_frame=1.2, precession_deg_per_frame=0.15,
         to_sun_cam=(-1.0, -0.6, -1.3), ambient=0.012, star_count=120, jpeg_quality=90, kind="demo",
     ),
-    asymmetry=0.5,
+    asymmetry=0.4,
 )  # fmt: skip
 
 CLIPS: dict[str, Clip] = {
