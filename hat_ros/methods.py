@@ -4,6 +4,7 @@
 * ``tracking``: refine the previous pose on each image; the best appearance only to (re-)start. No decoder, no fusion.
 * ``offline``: HAT's observations, then a backtrace and one joint optimisation of all frames, and dense refinement where
   the configuration refines. Not causal: a reference.
+* ``observe``: the front ends alone, candidates at every frame and no output: what temporal sweeps run on.
 
 Each offers what :class:`~hat_ros.tracker.HatTracker` offers, so the pipeline runs them all alike.
 """
@@ -24,11 +25,12 @@ from hat_ros.errors import UsageError
 from hat_ros.hypotheses.stage import HypothesisStage
 from hat_ros.refinement import create_refiner
 from hat_ros.segmentation.stage import SegmentationStage
+from hat_ros.slam.stage import MotionStage
 from hat_ros.target import Target
 from hat_ros.tracker import HatTracker, Step
 from hat_ros.types import Camera, Candidates, Detection, Estimate, Frame, Motion, Refined, Selection, TrackState
 
-MODES = ("hat", "independent", "tracking", "offline")
+MODES = ("hat", "independent", "tracking", "offline", "observe")
 
 _NO_POSE = np.full(7, np.nan)
 _NO_COVARIANCE = np.full((6, 6), np.nan)
@@ -59,7 +61,13 @@ def create_method(mode: str, config: HatConfig, target: Target) -> Method:
         UsageError: unknown mode.
         ConfigError: the configuration names an unknown backend.
     """
-    methods = {"hat": Hat, "independent": Independent, "tracking": Tracking, "offline": Offline}
+    methods = {
+        "hat": Hat,
+        "independent": Independent,
+        "tracking": Tracking,
+        "offline": Offline,
+        "observe": Observe,
+    }
     if mode not in methods:
         raise UsageError(f"mode '{mode}' is unknown, choose one of {', '.join(MODES)}")
     return methods[mode](config, target)
@@ -163,6 +171,39 @@ class _LastPose:
         refined = self._refiner.refine(frame, detection, self._T_cam_target)
         self._T_cam_target = None if refined is None else refined.T_cam_target
         return refined
+
+
+class Observe:
+    """What the front ends see when nobody asks for a pose: candidates at every frame, motion, no priors."""
+
+    causal = True
+
+    def __init__(self, config: HatConfig, target: Target) -> None:
+        config = replace(config, keyframes=replace(config.keyframes, gap_frames=1))
+        self._segmentation = SegmentationStage(config, target)
+        self._hypotheses = HypothesisStage(config, target)
+        self._motion = MotionStage(config, target)
+        self.stages = {"segmentation": self._segmentation, "hypotheses": self._hypotheses, "motion": self._motion}
+
+    def step(self, frame: Frame) -> Step:
+        """Look, and say nothing."""
+        detection = self._segmentation.update(frame, None)
+        candidates = self._hypotheses.update(frame, detection, None)
+        motion = self._motion.update(frame, detection, None)
+        nothing = Estimate(
+            frame.stamp_ns,
+            TrackState.UNINITIALISED,
+            _NO_POSE,
+            _NO_COVARIANCE,
+            keyframe=len(candidates) > 0,
+            n_candidates=len(candidates),
+            slam_epoch=motion.epoch,
+        )
+        return Step(detection, candidates, motion, Selection.none(), nothing)
+
+    def finish(self) -> list[Estimate]:
+        """Nothing."""
+        return []
 
 
 class Offline:

@@ -15,6 +15,7 @@ def add_commands(commands: Commands) -> None:
     _add_evaluate(commands)
     _add_plot(commands)
     _add_bench(commands)
+    _add_ablate(commands)
 
 
 def _add_evaluate(commands: Commands) -> None:
@@ -158,3 +159,37 @@ def _bench(arguments: argparse.Namespace) -> int:
     for line in failures:
         print(f"failed: {line}", file=sys.stderr)
     return 1 if failures else 0
+
+
+def _add_ablate(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "ablate",
+        help="component table, sensitivity sweeps, filters, offline reference",
+        description="Run the front ends once per clip, then Stages 3 and 4 over what they saw under every setting of "
+        "the paper's ablations. --config decides the temporal settings; --front-end, if given, takes segmentation, "
+        "hypotheses and motion (and the scale of the appearance score) from another preset.",
+    )
+    parser.add_argument("recordings", nargs="+", type=Path, metavar="SEQ", help="bag or sequence folder, with truth")
+    _add_campaign(parser)
+    parser.add_argument("--front-end", metavar="NAME|FILE", help="preset of the front ends (default: that of --config)")
+    parser.set_defaults(command=_ablate)
+
+
+def _ablate(arguments: argparse.Namespace) -> int:
+    from hat_ros.cli.console import campaign_progress
+    from hat_ros.evaluation import ablate
+    from hat_ros.evaluation.campaign import run_campaign
+
+    out = arguments.out.resolve()
+    plan = ablate.plan(
+        arguments.recordings, out, arguments.config, arguments.front_end, arguments.overrides, arguments.limit
+    )
+    with campaign_progress(len(plan.jobs)) as watch:
+        outcomes = run_campaign(plan.jobs, out, arguments.jobs, arguments.scheduler, watch)
+    for name, table in ablate.tables(plan, outcomes).items():
+        table.write(out, name)
+        print(table.text())
+    failed = [f"{outcome.job.name}: {outcome.failure}" for outcome in outcomes if outcome.figures is None]
+    for line in failed:
+        print(f"failed: {line}", file=sys.stderr)
+    return 1 if failed else 0

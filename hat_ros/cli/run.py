@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hat_ros.cli.options import Commands, add_config, add_out, add_threads, config_of, limit_threads, natural, positive
 
-MODES = ("hat", "independent", "tracking", "offline")
+MODES = ("hat", "independent", "tracking", "offline", "observe")
 
 
 def add_commands(commands: Commands) -> None:
@@ -87,7 +87,8 @@ def _add_track(commands: Commands) -> None:
         choices=MODES,
         default="hat",
         help="hat: the paper's method; independent: best hypothesis of every frame; tracking: refine the last pose; "
-        "offline: all frames jointly, not causal (default: hat)",
+        "offline: all frames jointly, not causal; observe: front ends only, candidates at every frame, no poses "
+        "(default: hat)",
     )
     _add_common(parser)
     add_threads(parser)

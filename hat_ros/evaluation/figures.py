@@ -55,7 +55,7 @@ def error_figure(log: RunLog) -> Figure:
         axis.grid(True, which="major", alpha=0.3)
         for moment in t[log.reset]:
             axis.axvline(moment, color="#b00020", linestyle="--", linewidth=1)
-    anchors = anchor_errors_deg(log)
+    anchors = log.anchor_errors_deg()
     best = metrics.best_of_k_deg([group.pose_rows for group in log.candidates], log.T_true)
     at = log.keyframe & np.isfinite(best)
     axes[0].plot(t[at], np.maximum(best[at], 0.05), "x", color="#888888", markersize=4, label="best candidate")
@@ -64,16 +64,6 @@ def error_figure(log: RunLog) -> Figure:
     axes[0].legend(loc="upper right", fontsize=8, ncols=2)
     _event_rows(axes[3], t, log)
     return figure
-
-
-def anchor_errors_deg(log: RunLog) -> metrics.Float:
-    """(N,) rotation error of the selected candidate, NaN where none was selected."""
-    out = np.full(len(log), np.nan)
-    for i in np.flatnonzero((log.anchor >= 0) & log.has_truth):
-        if log.anchor[i] < len(log.candidates[i]):
-            R = lie.matrix_from_row(log.candidates[i].pose_rows[log.anchor[i]])[:3, :3]
-            out[i] = np.degrees(lie.angle_between(R, log.T_true[i, :3, :3]))
-    return out
 
 
 def pose_figure(log: RunLog) -> Figure:

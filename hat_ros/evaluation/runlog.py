@@ -87,6 +87,15 @@ class RunLog:
         """(N,) the alignment was dropped at this frame, for disagreement or for a new SLAM epoch."""
         return (np.diff(self.alignment_version > 0, prepend=False)) & (self.alignment_version == 0)
 
+    def anchor_errors_deg(self) -> Float:
+        """(N,) rotation error of the selected candidate, NaN where none was selected."""
+        out = np.full(len(self), np.nan)
+        for i in np.flatnonzero((self.anchor >= 0) & self.has_truth):
+            if self.anchor[i] < len(self.candidates[i]):
+                R = lie.matrix_from_row(self.candidates[i].pose_rows[self.anchor[i]])[:3, :3]
+                out[i] = np.degrees(lie.angle_between(R, self.T_true[i, :3, :3]))
+        return out
+
     def motion(self, index: int) -> Motion:
         """What was known of the camera's motion at one frame."""
         if not self.motion_valid[index]:

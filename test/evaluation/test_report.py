@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scripted import steps, truth
 
-from hat_ros.evaluation.figures import anchor_errors_deg, error_figure, image_bytes
+from hat_ros.evaluation.figures import error_figure, image_bytes
 from hat_ros.evaluation.report import write_report
 from hat_ros.evaluation.runlog import RunLogBuilder
 from hat_ros.evaluation.score import score_run, write_json
@@ -61,7 +61,7 @@ def test_same_run_same_picture(form):
 
 
 def test_anchor_errors():
-    errors = anchor_errors_deg(log_of())
+    errors = log_of().anchor_errors_deg()
     np.testing.assert_allclose(errors[[0, 4, 8]], 2.0)
     assert np.isnan(np.delete(errors, [0, 4, 8])).all()
 

@@ -1,0 +1,95 @@
+"""Stages 3 and 4 over what the front ends saw once: a temporal setting costs a second instead of a run.
+
+The observations are a result bag of ``--mode observe``: candidates at every frame, motion at every frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+
+from hat_ros import lie
+from hat_ros.config import HatConfig
+from hat_ros.core.fusion import FusionStage
+from hat_ros.core.keyframes import KeyframeSchedule
+from hat_ros.core.offline import solve_offline
+from hat_ros.core.selector import SelectorStage
+from hat_ros.evaluation.runlog import RunLog, RunLogBuilder
+from hat_ros.types import Camera, Candidates, Estimate, Frame, Motion, Selection, TrackState
+
+
+class Selector(Protocol):
+    """Whatever chooses one candidate per keyframe: Stage 3, or a filter in its place."""
+
+    def update(self, candidates: Candidates, motion: Motion) -> Selection:
+        """One frame; ``Selection.none()`` without candidates."""
+        ...
+
+
+def keyframes_of(log: RunLog, config: HatConfig) -> list[Candidates]:
+    """The candidates that a run with this keyframe gap and K would have seen: N sets, empty between keyframes."""
+    schedule = KeyframeSchedule(config.keyframes)
+    keep = config.hypotheses.max_candidates
+    out = []
+    for group in log.candidates:
+        due = schedule.update(len(group) > 0)
+        out.append(
+            Candidates(group.pose_rows[:keep], group.log_score[:keep], group.box_xyxy) if due else Candidates.none()
+        )
+    return out
+
+
+def replay_temporal(log: RunLog, config: HatConfig, selector: Selector | None = None) -> RunLog:
+    """Selection, alignment and fusion as published (no refinement on images) over recorded observations.
+
+    As in ``hat temporal`` a pose is given for every frame after the first anchor: nothing is ever LOST.
+
+    Args:
+        log: observations of ``--mode observe``.
+        config: temporal configuration; its keyframe gap and K are applied to the observations.
+        selector: takes the place of Stage 3.
+    """
+    config = replace(config, fusion=replace(config.fusion, coast_limit_frames=max(1, len(log))))
+    selector = selector or SelectorStage(config.selector)
+    fusion = FusionStage(config, None)
+    builder = RunLogBuilder()
+    for i, candidates in enumerate(keyframes_of(log, config)):
+        motion = log.motion(i)
+        selection = selector.update(candidates, motion)
+        estimate = fusion.update(_imageless(int(log.stamp_ns[i])), None, motion, selection)
+        builder.add(candidates, motion, estimate)
+    return _beside_truth(builder, log)
+
+
+def replay_offline(log: RunLog, config: HatConfig) -> RunLog:
+    """The offline reference over the same observations."""
+    candidates = keyframes_of(log, config)
+    motions = [log.motion(i) for i in range(len(log))]
+    result = solve_offline(candidates, motions, config)
+    builder = RunLogBuilder()
+    for i, T in enumerate(result.T_cam_target):
+        known = bool(np.isfinite(T).all())
+        estimate = Estimate(
+            int(log.stamp_ns[i]),
+            TrackState.TRACKING if known else TrackState.UNINITIALISED,
+            lie.row_from_matrix(T) if known else np.full(7, np.nan),
+            np.full((6, 6), np.nan),
+            keyframe=len(candidates[i]) > 0,
+            n_candidates=len(candidates[i]),
+            anchor=int(result.chosen[i]),
+            slam_epoch=motions[i].epoch,
+        )
+        builder.add(candidates[i], motions[i], estimate)
+    return _beside_truth(builder, log)
+
+
+def _beside_truth(builder: RunLogBuilder, log: RunLog) -> RunLog:
+    known = np.flatnonzero(log.has_truth)
+    return builder.build({int(log.stamp_ns[i]): log.truth_rows[i] for i in known})
+
+
+def _imageless(stamp_ns: int) -> Frame:
+    """A frame of which only the stamp is ever read."""
+    return Frame(stamp_ns, np.zeros((1, 1, 3), dtype=np.uint8), Camera(np.eye(3), 1, 1))
