@@ -1,0 +1,169 @@
+"""Temporal replay, the filters, and the ablation tables, on observations made by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hat_ros import lie
+from hat_ros.config import HatConfig, KeyframeConfig
+from hat_ros.core.selector import SelectorStage
+from hat_ros.errors import ConfigError, UsageError
+from hat_ros.evaluation import ablate
+from hat_ros.evaluation.filters import FilterNoise, ParticleSelector, UkfSelector
+from hat_ros.evaluation.runlog import RunLogBuilder
+from hat_ros.evaluation.temporal_replay import keyframes_of, replay_offline, replay_temporal
+from hat_ros.temporal import Observations, run_temporal
+from hat_ros.types import Candidates, Estimate, Motion, TrackState
+
+N = 80
+CONFIG = HatConfig(keyframes=KeyframeConfig(gap_frames=4))
+FLIP = lie.so3_exp(np.array([0.0, np.pi, 0.0]))
+
+
+def true_pose(i, rate_deg=2.0):
+    R = lie.so3_exp(np.radians([rate_deg * i, 0, 0])) @ lie.so3_exp(np.array([0.3, -0.5, 0.8]))
+    return lie.transform(R, np.array([0.2 * np.sin(i / 9), 0.1, 6 + 0.02 * i]))
+
+
+def observations(flip_every=0, noise_deg=0.5, seed=0, motion=True, n=N):
+    """Right and half-turned candidates at every frame; at every ``flip_every``-th the wrong one looks better."""
+    rng = np.random.default_rng(seed)
+    gauge = lie.transform(lie.so3_exp(np.array([1.0, 2.0, 0.5])), np.array([3.0, -1.0, 2.0]))
+    builder, truth = RunLogBuilder(), {}
+    for i in range(n):
+        T = true_pose(i)
+        stamp = 1_000_000_000 + i * 100_000_000
+        truth[stamp] = lie.row_from_matrix(T)
+        noisy = T.copy()
+        noisy[:3, :3] = lie.so3_exp(np.radians(noise_deg) * rng.standard_normal(3)) @ T[:3, :3]
+        wrong = noisy.copy()
+        wrong[:3, :3] = noisy[:3, :3] @ FLIP
+        better = [0.0, 0.3] if flip_every and i % flip_every == flip_every - 1 else [0.3, 0.0]
+        candidates = Candidates.from_matrices(np.array([noisy, wrong]), np.array(better), np.array([10, 10, 110, 110]))
+        step = Motion.none()
+        if motion:
+            T_slam_cam = gauge @ lie.inverse(T)
+            T_slam_cam[:3, 3] /= 2.5
+            step = Motion(True, 0, lie.row_from_matrix(T_slam_cam))
+        nothing = Estimate(stamp, TrackState.UNINITIALISED, np.full(7, np.nan), np.full((6, 6), np.nan), keyframe=True)
+        builder.add(candidates, step, nothing)
+    return builder.build(truth)
+
+
+def pooled(log):
+    return ablate.pooled([log])
+
+
+def test_keyframes_follow_gap_and_k():
+    log = observations()
+    groups = keyframes_of(log, replace(CONFIG, hypotheses=replace(CONFIG.hypotheses, max_candidates=1)))
+    assert [len(group) for group in groups[:9]] == [1, 0, 0, 0, 1, 0, 0, 0, 1]
+
+
+def test_replay_is_hat_temporal_on_the_same_observations():
+    log = observations(flip_every=3)
+    groups = keyframes_of(log, CONFIG)
+    recorded = Observations(
+        slam=lie.matrix_from_row(log.motion_rows),
+        key=np.array([len(group) > 0 for group in groups]),
+        poses=np.array([group.T_cam_target for group in log.candidates]),
+        scores=np.array([group.log_score for group in log.candidates]),
+        box_area_px=np.full(N, 1e4),
+    )
+    expected = run_temporal(recorded, CONFIG)
+    replayed = replay_temporal(log, CONFIG)
+    np.testing.assert_allclose(replayed.T_est, expected.T_cam_target, atol=1e-9)
+    np.testing.assert_array_equal(replayed.anchor, expected.chosen)
+
+
+def test_every_frame_after_the_first_anchor_has_a_pose():
+    log = observations()
+    sparse = replace(
+        CONFIG, keyframes=KeyframeConfig(gap_frames=70), fusion=replace(CONFIG.fusion, coast_limit_frames=1)
+    )
+    assert pooled(replay_temporal(log, sparse))["coverage"] == 1.0
+
+
+def test_selection_earns_its_place_where_appearance_flips():
+    log = observations(flip_every=5)
+    rows = {row.name: pooled(row.variant(log)) for row in ablate.component_rows(CONFIG)}
+    fusion_only, viterbi = (rows[name] for name in ("keyframe anchors + SLAM fusion", "+ Viterbi basin selection"))
+    assert fusion_only["anchor_over_90_share"] == 0.2
+    assert viterbi["anchor_over_90_share"] == 0.05, "only the one during the warm-up"
+    assert viterbi["E_p_mean"] < 0.6 * fusion_only["E_p_mean"]
+
+
+def test_offline_is_no_worse_than_causal_on_the_same_observations():
+    log = observations(flip_every=2, noise_deg=2.0)
+    causal, offline = pooled(replay_temporal(log, CONFIG)), pooled(replay_offline(log, CONFIG))
+    assert offline["coverage"] == 1.0
+    assert offline["E_p_mean"] <= causal["E_p_mean"]
+
+
+@pytest.mark.parametrize("make", [ParticleSelector, UkfSelector, SelectorStage])
+def test_selectors_resist_flips_and_answer_with_a_candidate(make):
+    log = observations(flip_every=3)
+    result = replay_temporal(log, CONFIG, make(CONFIG.selector))
+    chosen = result.anchor[result.keyframe]
+    assert set(chosen) <= {0, 1}
+    assert np.nanmean(result.anchor_errors_deg()[20:] > 90) == 0.0
+
+
+@pytest.mark.parametrize("make", [ParticleSelector, UkfSelector])
+def test_filters_give_the_same_answer_every_time_and_do_not_depend_on_the_gauge(make):
+    log = observations(flip_every=3)
+    first = replay_temporal(log, CONFIG, make(CONFIG.selector))
+    again = replay_temporal(log, CONFIG, make(CONFIG.selector))
+    np.testing.assert_array_equal(first.pose_rows, again.pose_rows)
+    other_gauge = lie.transform(lie.so3_exp(np.array([-1.0, 0.4, 2.0])), np.array([1.0, 1.0, 1.0]))
+    rows = lie.row_from_matrix(other_gauge @ lie.matrix_from_row(log.motion_rows))
+    moved = replay_temporal(replace(log, motion_rows=rows), CONFIG, make(CONFIG.selector))
+    np.testing.assert_array_equal(first.anchor, moved.anchor)
+
+
+@pytest.mark.parametrize("make", [ParticleSelector, UkfSelector])
+def test_filters_go_on_without_motion_and_skip_empty_frames(make):
+    log = observations(motion=False)
+    selector = make(CONFIG.selector, FilterNoise(particles=200))
+    assert selector.update(Candidates.none(), Motion.none()).selected == -1
+    assert all(selector.update(group, Motion.none()).selected >= 0 for group in log.candidates)
+
+
+def test_particles_stay_normalised_and_the_covariance_positive():
+    log = observations(flip_every=3)
+    particles, ukf = ParticleSelector(CONFIG.selector, FilterNoise(particles=300)), UkfSelector(CONFIG.selector)
+    for i, group in enumerate(log.candidates):
+        particles.update(group, log.motion(i))
+        ukf.update(group, log.motion(i))
+    assert particles._weight.sum() == pytest.approx(1.0)
+    assert lie.is_rigid(lie.transform(particles._R, np.zeros((300, 3)))).all()
+    assert np.linalg.eigvalsh(ukf._covariance).min() > 0
+
+
+def test_sweeps_cover_the_papers_settings():
+    names = [row.name for row in ablate.sweep_rows(CONFIG)]
+    for name in ("stride 5, K = 5", "stride 40, K = 5", "K = 10", "s0 = 300 px", "D off", "w = 0.5", "no size weight"):
+        assert name in names
+
+
+def test_table_pools_the_frames_of_all_clips():
+    one, two = observations(n=20), observations(n=60, flip_every=2)
+    table = ablate.table_of("t", [ablate.Row("x", lambda log: replay_temporal(log, CONFIG))], [one, two])
+    assert table.rows[0]["targets"] == 80
+
+
+def test_plan_merges_presets_and_refuses_bad_ones(tmp_path):
+    clip = tmp_path / "clip"
+    clip.mkdir()
+    temporal, front = tmp_path / "temporal.yaml", tmp_path / "front.yaml"
+    temporal.write_text("fusion: {gate_angle_deg: 75.0}\nselector: {score_scale: 3.0}\n")
+    front.write_text("hypotheses: {max_candidates: 5}\nselector: {score_scale: 0.5}\nfusion: {gate_angle_deg: 1.0}\n")
+    plan = ablate.plan([clip], tmp_path / "out", str(temporal), str(front))
+    assert plan.config.fusion.gate_angle_deg == 75.0
+    assert (plan.config.hypotheses.max_candidates, plan.config.selector.score_scale) == (5, 0.5)
+    assert {job.mode for job in plan.jobs} == {"observe", "tracking"}
+    with pytest.raises(ConfigError, match="fusion"):
+        ablate.plan([clip], tmp_path / "out", str(temporal), overrides=["fusion.nope=1"])
+    with pytest.raises(UsageError, match="no such file"):
+        ablate.plan([tmp_path / "none"], tmp_path / "out", str(temporal))
