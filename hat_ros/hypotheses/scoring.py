@@ -56,22 +56,25 @@ class Scorer:
         self._render_px = render_px
         self._luma = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
 
-    def mismatch(self, view: View, fit: Fit, tolerance_px: float) -> tuple[float, float, float]:
+    def mismatch(self, view: View, outline_px: float, tolerance_px: float) -> tuple[float, float, float]:
         """Excess, missing and hidden (see :class:`Evidence`) of what disagrees deeper than a tolerance."""
         distance = self.field.resample(view)
-        silhouette = view.rendering.mask
+        silhouette = view.mask
         inside = view.inside(self._luma.shape)
         unit = 1.0 / view.scale**2
         in_mask = np.clip(-distance - tolerance_px, 0.0, 1.0)
         covered = float(in_mask[silhouette].sum()) * unit
-        total = float(np.clip(-self.field.distance - tolerance_px, 0.0, 1.0)[self.field.inside].sum())
         beside = silhouette if inside is None else silhouette & inside
         uncovered = np.clip(distance[beside] - tolerance_px, 0.0, 1.0)
         visible = np.minimum(view.resample(self._luma)[beside] * (1.0 / _VISIBLE_LEVEL), 1.0)
         missing = float((uncovered * visible).sum()) * unit
         hidden = float(uncovered.sum()) * unit - missing
-        outline = max(fit.outline_px, 1.0)
-        return max(total - covered, 0.0) / outline, missing / outline, hidden / outline
+        outline = max(outline_px, 1.0)
+        return (
+            max(self.field.area_deeper_than(tolerance_px) - covered, 0.0) / outline,
+            missing / outline,
+            hidden / outline,
+        )
 
     def evidence(self, fit: Fit) -> Evidence | None:
         """Gather the evidence for a refined pose; None when it cannot be seen."""
@@ -82,7 +85,7 @@ class Scorer:
         total = fit.outline_px
         if total <= 0:
             return None
-        excess, missing, hidden = self.mismatch(view, fit, _TOLERANCE_PX + abs(fit.mask_bias_px))
+        excess, missing, hidden = self.mismatch(view, total, _TOLERANCE_PX + abs(fit.mask_bias_px))
         mask_residual = fit.contour[:, 1] - fit.mask_bias_px
         near = length * fit.contour[:, 2]
         edge = (fit.contour[:, 4] > 0) & (np.abs(fit.contour[:, 3]) < 1.5)

@@ -27,6 +27,7 @@ from hat_ros.hypotheses.matching import (
 from hat_ros.hypotheses.scoring import Evidence, Scorer, log_score, shape_score
 from hat_ros.refinement.refiner import Fit, PoseFitter, Schedule
 from hat_ros.refinement.view import MaskField, TargetViewer
+from hat_ros.render import create_renderer
 from hat_ros.target import Target
 from hat_ros.types import Candidates, Detection, Frame, PosePrior
 
@@ -65,7 +66,7 @@ class TemplateHypotheses:
         self._target = target
         self._viewer = TargetViewer(target)
         self._fitter = PoseFitter(self._viewer, options.render_px, _CONTOUR_POINTS)
-        self._bank = load_or_build(target, self._viewer.renderer, options.n_views, options.n_angles)
+        self._bank = load_or_build(target, create_renderer("embree", target), options.n_views, options.n_angles)
 
     def generate(self, frame: Frame, detection: Detection, prior: PosePrior | None) -> Candidates:
         """Up to K refined and scored poses, best first; zero rows when nothing fits."""
@@ -118,11 +119,12 @@ class TemplateHypotheses:
         """Refine on the mask with rendered contours: poses and their shape scores."""
         poses, scores = [], []
         for T in starts:
-            fit = self._fitter.fit(T, frame.camera, frame.rgb, scorer.field, (_FIRST,))
-            view = None if fit is None else self._viewer.view(fit.T_cam_target, frame.camera, self._options.render_px)
-            if view is not None:
-                poses.append(fit.T_cam_target)
-                scores.append(shape_score(*scorer.mismatch(view, fit, _SELECTION_TOLERANCE_PX)))
+            view = self._viewer.view(T, frame.camera, self._options.render_px)
+            if view is None:
+                continue
+            fit = self._fitter.iterate(T, view, frame.camera, frame.rgb, scorer.field, _FIRST)
+            poses.append(fit.T_cam_target)
+            scores.append(shape_score(*scorer.mismatch(view, fit.outline_px, _SELECTION_TOLERANCE_PX)))
         return poses, scores
 
     def _select(self, poses: list[NDArray[np.float64]], scores: list[float]) -> list[NDArray[np.float64]]:

@@ -46,10 +46,10 @@ class FusedPoseRefiner:
         if fit is None or not self._same_basin(T_cam_target, fit.T_cam_target):
             return None
         covariance = pose_covariance(fit, self._target.bounding_radius_m)
-        view = self._viewer.view(fit.T_cam_target, frame.camera, self._config.render_px)
-        if covariance is None or view is None:
+        if covariance is None:
             return None
-        overlap = float("nan") if field is None else field.compare(view).union_share
+        # The last round starts where the one before it converged: its view is the result's but for part of a pixel.
+        overlap = float("nan") if field is None else field.compare(fit.view).union_share
         return Refined(lie.row_from_matrix(fit.T_cam_target), covariance, overlap, fit.support)
 
     def reset(self) -> None:

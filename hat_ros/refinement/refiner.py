@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hat_ros import lie
 from hat_ros.refinement.solver import fit_contour
-from hat_ros.refinement.view import ContourLines, MaskField, TargetViewer, contour_lines
+from hat_ros.refinement.view import MaskField, TargetViewer, View, contour_lines
 from hat_ros.types import Camera, Frame
 
 _NO_DISTANCE = np.zeros((2, 2), np.float32)
@@ -32,9 +32,8 @@ class Schedule:
 
 # The mask leads the way, then the image's own edges take over; without a mask long lines lead the way.
 WITH_MASK = (
-    Schedule((0, 0, 0, 0), (1, 1, 1, 1), (12, 8, 5, 4), damping=1e-2),
-    Schedule((0, 0, 4, 4), (1, 1, 2, 2), (4, 3, 2, 2)),
-    Schedule((4, 3.5, 3), (1.5, 1.5, 1.5), (1.5, 1.5, 1.5)),
+    Schedule((0, 0, 6, 4), (1, 1, 3, 2), (10, 6, 4, 3), damping=3e-3),
+    Schedule((4, 4, 3.5, 3), (2, 1.5, 1.5, 1.5), (2.5, 2, 1.5, 1.5)),
 )
 WITHOUT_MASK = (
     Schedule((16, 16, 12, 12), (8, 8, 6, 6), (0, 0, 0, 0)),
@@ -53,6 +52,7 @@ class Fit:
         contour: (N, 5) as returned by the solver.
         lines: (N, 5) of the contour it belongs to.
         mask_bias_px: how far outside the target's outline the mask's lies, as estimated.
+        view: rendered at the start of the last round.
     """
 
     T_cam_target: NDArray[np.float64]
@@ -60,6 +60,7 @@ class Fit:
     contour: NDArray[np.float64]
     lines: NDArray[np.float64]
     mask_bias_px: float
+    view: View
 
     @property
     def outline_px(self) -> float:
@@ -102,8 +103,7 @@ class PoseFitter:
             view = self.viewer.view(T, camera, self._render_px)
             if view is None:
                 return None
-            lines = contour_lines(view, T, self._max_points)
-            fit = self._iterate(T, lines, camera, image, field, schedule)
+            fit = self.iterate(T, view, camera, image, field, schedule)
             T = fit.T_cam_target
         return fit
 
@@ -135,20 +135,22 @@ class PoseFitter:
         )
         return lie.transform(R, t)
 
-    def _iterate(
+    def iterate(
         self,
-        T: NDArray[np.float64],
-        lines: ContourLines,
+        T_cam_target: NDArray[np.float64],
+        view: View,
         camera: Camera,
         image: NDArray[np.uint8],
         field: MaskField | None,
         schedule: Schedule,
     ) -> Fit:
+        """One round with the contour of a view rendered at the start pose."""
+        lines = contour_lines(view, T_cam_target, self._max_points)
         R, t, H, contour, mask_bias, _ = fit_contour(
             lines.points_m,
             lines.lines,
-            np.ascontiguousarray(T[:3, :3]),
-            np.ascontiguousarray(T[:3, 3]),
+            np.ascontiguousarray(T_cam_target[:3, :3]),
+            np.ascontiguousarray(T_cam_target[:3, 3]),
             camera.K,
             image,
             np.array(schedule.reach, dtype=np.float64),
@@ -159,4 +161,4 @@ class PoseFitter:
             np.full(len(schedule.reach), schedule.damping),
             self.viewer.target.bounding_radius_m,
         )
-        return Fit(lie.transform(R, t), H, contour, lines.lines, mask_bias)
+        return Fit(lie.transform(R, t), H, contour, lines.lines, mask_bias, view)

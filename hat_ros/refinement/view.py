@@ -17,7 +17,7 @@ from hat_ros.refinement.contour import (
     COL_WEIGHT,
     contour_table,
 )
-from hat_ros.render import Rendering, create_renderer
+from hat_ros.render.embree import RayCaster
 from hat_ros.target import Target
 from hat_ros.types import Camera
 
@@ -25,20 +25,25 @@ from hat_ros.types import Camera
 _CROP_MARGIN_PX = 4
 # Signed distance reported beyond the field of a mask.
 _FAR_OUTSIDE_PX = 1e3
+# Histogram of how deep inside the mask its pixels lie.
+_DEPTH_BIN_PX = 0.05
+_DEPTH_BINS = 200
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A rendered crop that holds the whole target, at its own resolution.
+    """The silhouette on a crop that holds the whole target, at its own resolution.
 
     Attributes:
-        rendering: the crop.
-        camera: its intrinsics.
+        mask: (h, w) bool silhouette.
+        depth_m: (h, w) float32 depth along the optical axis near the outline; unspecified elsewhere.
+        camera: intrinsics of the crop.
         origin_px: (2,) image position of the crop's pixel (0, 0).
         scale: crop pixels per image pixel.
     """
 
-    rendering: Rendering
+    mask: NDArray[np.bool_]
+    depth_m: NDArray[np.float32]
     camera: Camera
     origin_px: NDArray[np.float64]
     scale: float
@@ -60,17 +65,17 @@ class View:
 
 
 class TargetViewer:
-    """Renders views of one target for refinement and scoring."""
+    """Casts silhouettes of one target for refinement and scoring: every second pixel, then all near the outline."""
 
     def __init__(self, target: Target) -> None:
         self.target = target
-        self.renderer = create_renderer("embree", target)
+        self._caster = RayCaster(target)
         try:
             self._hull_m = target.vertices_m[ConvexHull(target.vertices_m).vertices]
         except QhullError:  # a flat model
             self._hull_m = target.vertices_m
 
-    def view(self, T_cam_target: NDArray[np.float64], camera: Camera, side_px: int, color: bool = False) -> View | None:
+    def view(self, T_cam_target: NDArray[np.float64], camera: Camera, side_px: int) -> View | None:
         """The target at a pose, its longer side ``side_px`` crop pixels; None when it reaches behind the camera."""
         points = self._hull_m @ T_cam_target[:3, :3].T + T_cam_target[:3, 3]
         if not np.isfinite(points).all() or points[:, 2].min() <= 1e-3 * self.target.bounding_radius_m:
@@ -85,8 +90,43 @@ class TargetViewer:
         K = camera.K.copy()
         K[:2, 2] -= origin
         K[:2] *= scale
-        crop = Camera(K, int(width), int(height))
-        return View(self.renderer.render(T_cam_target, crop, color=color), crop, origin, scale)
+        crop = Camera(K, int(width + width % 2), int(height + height % 2))
+        mask, depth = self._cast(T_cam_target, crop)
+        return View(mask, depth, crop, origin, scale)
+
+    def _cast(self, T_cam_target: NDArray[np.float64], crop: Camera) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+        """Silhouette and depth near its outline, both (h, w)."""
+        R, t = T_cam_target[:3, :3], T_cam_target[:3, 3]
+        to_ray = (R.T @ np.linalg.inv(crop.K)).T  # rays in the target frame are affine in the pixel
+        origin = -t @ R
+        ys, xs = np.mgrid[0 : crop.height : 2, 0 : crop.width : 2]
+        hit, z = self._trace(xs.ravel(), ys.ravel(), to_ray, origin)
+        coarse = hit.reshape(xs.shape).view(np.uint8)
+        kernel = np.ones((3, 3), np.uint8)
+        near = cv2.dilate(coarse, kernel) != cv2.erode(coarse, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+        mask = np.repeat(np.repeat(coarse.view(np.bool_), 2, axis=0), 2, axis=1)
+        depth = np.zeros(mask.shape, np.float32)
+        depth[::2, ::2] = z.reshape(xs.shape)
+        todo = np.repeat(np.repeat(near, 2, axis=0), 2, axis=1)
+        todo[::2, ::2] = False
+        y, x = np.nonzero(todo)
+        if len(x):
+            hit, z = self._trace(x, y, to_ray, origin)
+            mask[y, x] = hit
+            depth[y, x] = z
+        return mask, depth
+
+    def _trace(
+        self, x: NDArray[np.intp], y: NDArray[np.intp], to_ray: NDArray[np.float64], origin: NDArray[np.float64]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+        """Hit (N,) and depth (N,) of the rays through crop pixels."""
+        directions = np.empty((len(x), 3), np.float32)
+        for axis in range(3):
+            directions[:, axis] = x * to_ray[0, axis] + y * to_ray[1, axis] + to_ray[2, axis]
+        origins = np.empty_like(directions)
+        origins[:] = origin
+        hits = self._caster.trace(origins, directions)
+        return hits["primID"] >= 0, hits["tfar"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +145,7 @@ class ContourLines:
 
 def contour_lines(view: View, T_cam_target: NDArray[np.float64], max_points: int) -> ContourLines:
     """Sample the contour of a view."""
-    table = contour_table(view.rendering.depth_m, view.rendering.mask, view.camera.K, max_points)
+    table = contour_table(view.depth_m, view.mask, view.camera.K, max_points)
     points = (table[:, :3] - T_cam_target[:3, 3]) @ T_cam_target[:3, :3]
     lines = table[:, [COL_NU, COL_NV, COL_WEIGHT, COL_INSIDE, COL_OUTSIDE]]
     lines[:, 2:] /= view.scale
@@ -138,7 +178,11 @@ class MaskField:
         inside = cv2.distanceTransform(crop, cv2.DIST_L2, 5) - 0.5 if not crop.all() else np.full_like(outside, 1e3)
         distance = np.where(crop > 0, -inside, outside).astype(np.float32)
         self.distance = cv2.GaussianBlur(distance, (0, 0), 1.0)
-        self.inside = ((iy == np.arange(y0, y1))[:, None]) & ((ix == np.arange(x0, x1))[None])
+        within = ((iy == np.arange(y0, y1))[:, None]) & ((ix == np.arange(x0, x1))[None])
+        depth = -self.distance[within & (self.distance < 0)]
+        self._depth_counts = np.bincount(
+            np.minimum(depth * (1 / _DEPTH_BIN_PX), _DEPTH_BINS - 1).astype(np.intp), minlength=_DEPTH_BINS
+        )
 
     def resample(self, view: View) -> NDArray[np.float32]:
         """Signed distance in image pixels, seen through a view's crop; far outside beyond the field."""
@@ -152,10 +196,15 @@ class MaskField:
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         return cv2.warpAffine(self.distance, affine, size, flags=flags, borderValue=_FAR_OUTSIDE_PX)
 
+    def area_deeper_than(self, depth_px: float) -> float:
+        """Mask pixels further than this from the outline; counted in part over one pixel of depth."""
+        centers = (np.arange(_DEPTH_BINS) + 0.5) * _DEPTH_BIN_PX
+        return float(self._depth_counts @ np.clip(centers - depth_px, 0.0, 1.0))
+
     def compare(self, view: View) -> Overlap:
         """Areas of agreement and disagreement with a rendered silhouette."""
         seen = self.resample(view)
-        silhouette = view.rendering.mask
+        silhouette = view.mask
         inside = view.inside(self.mask.shape)
         if inside is not None:
             silhouette = silhouette & inside
