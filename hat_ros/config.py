@@ -239,6 +239,7 @@ class RefinementConfig:
     min_support: float = option(0.4, "share of the contour that must agree with the image", low=0, high=1)
     same_pose_deg: float = option(5.0, "a start this close to a refined pose is not refined once more", low=0, high=180)
     arbitration_margin: float = option(0.15, "summed lead in image evidence that decides between basins", low=0)
+    certain_quality: float = option(0.9, "image evidence that needs no second anchor to be TRACKING", low=0, high=1)
 
 
 @dataclass(frozen=True)

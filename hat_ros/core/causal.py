@@ -28,6 +28,7 @@ class Fused:
         reset: the alignment was dropped at this frame.
         measurement: (4, 4) what this frame's own image says, None when it says nothing.
         covariance: (6, 6) of the measurement, None when its source does not know.
+        doubtful: the measurement may stand in the wrong basin.
     """
 
     T_cam_target: Float | None
@@ -36,6 +37,7 @@ class Fused:
     reset: bool = False
     measurement: Float | None = None
     covariance: Float | None = None
+    doubtful: bool = False
 
 
 class CausalFusion:

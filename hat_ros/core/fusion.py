@@ -26,8 +26,9 @@ class FusionStage:
     """One :meth:`update` per frame; past outputs are never revised.
 
     States: UNINITIALISED before the first pose. TRACKING while poses are solved for: from anchors and motion, or, with
-    a refiner, supported by this frame's image. COASTING while the pose is only held or predicted. LOST once
-    ``coast_limit_frames`` went by without a measurement (an anchor, or an accepted refinement); no pose then.
+    a refiner, supported by this frame's image and not doubtful. COASTING while the pose is only held, predicted, or in
+    doubt. LOST once ``coast_limit_frames`` went by without a measurement (an anchor, or a supported refinement); no
+    pose then.
     """
 
     def __init__(self, config: HatConfig, refiner: Refiner | None) -> None:
@@ -105,8 +106,8 @@ class FusionStage:
             self._last_pose = None
             return TrackState.LOST, None
         self._last_pose = T_cam_target
-        solved = fused.T_cam_target is not None if self._refined is None else fused.measurement is not None
-        return (TrackState.TRACKING if solved else TrackState.COASTING), T_cam_target
+        found = fused.T_cam_target is not None if self._refined is None else fused.measurement is not None
+        return (TrackState.TRACKING if found and not fused.doubtful else TrackState.COASTING), T_cam_target
 
     def _fill_gap(self, motion: Motion) -> Float | None:
         """The last pose, held, or turned by the SLAM rotation about a held position."""

@@ -7,13 +7,14 @@ like an anchor: it becomes the output, and with it the previous output of the ne
 At keyframes the selected anchor competes with the track:
 
 * Within D of the track it is one basin, and the anchor one more start for the refinement: the best result wins.
-* Beyond D it is a rival. Successive rivals that follow from each other (the paper's coherence) add up; the image may
-  decide early. The rival takes over when it is supported and the track is not, when its lead in image evidence, summed
-  over coherent rivals, reaches ``arbitration_margin``, or after ``reset_anchors`` coherent rivals as in the paper,
-  unless the image speaks against them by that margin. Until as many anchors as the fusion's warm-up have agreed with
-  the track, a single rival is enough: the first ones are chosen by appearance alone.
+* Beyond D it is a rival. Successive rivals that follow from each other (the paper's coherence) add up, and so does
+  their lead in image evidence over the track. A rival takes over once it is supported and leads by
+  ``arbitration_margin``, or once as many coherent rivals stand against the track as anchors stood for it
+  (``reset_anchors`` at most, as in the paper), unless the image speaks against them by that margin.
 
-With neither refinement accepted, the output is what the paper's fusion makes of prediction and anchor, and it coasts.
+With no refinement supported, the output is what the paper's fusion makes of prediction and anchor, and it coasts. A
+supported output is called TRACKING only if it is beyond doubt as well: the image is certain, or a second anchor has
+agreed; and no two anchors in a row have disagreed since.
 """
 
 from __future__ import annotations
@@ -55,8 +56,13 @@ class RefinedFusion:
     def lose(self) -> None:
         """Give the track up: the next supported anchor starts afresh."""
         self._output: tuple[Float, Motion] | None = None
-        self._n_agreed = 0
+        self._start_track()
         self._measured: deque[tuple[int, Float]] = deque(maxlen=_RATE_HISTORY)
+
+    def _start_track(self) -> None:
+        """Nobody has spoken for or against the track yet."""
+        self._n_agreed = 0
+        self._n_disagreed = 0
         self._forget_rivals()
 
     def update(
@@ -71,7 +77,6 @@ class RefinedFusion:
         if fused.reset:
             self.alignment.reset()
             self._measured.clear()
-            self._n_agreed = 0
         if fused.measurement is not None:
             self._measured.append((frame.stamp_ns, fused.measurement))
             if anchor is not None and motion.valid:
@@ -93,20 +98,21 @@ class RefinedFusion:
             return self._start(frame, detection, anchor)
         predicted = predictions[0]
         if anchor is None:
-            return _outcome(track, predicted, predicted)
-        reference = predicted if track is None else track.T_cam_target
+            return self._outcome(track, predicted, predicted)
+        reference = track.T_cam_target if self._is_supported(track) else predicted
         if not self._dissent.update(anchor, reference):
             self._forget_rivals()
             self._n_agreed += 1
+            self._n_disagreed = 0
             return self._agree(frame, detection, track, predicted, anchor, confidence)
         return self._arbitrate(frame, detection, track, predicted, anchor)
 
     def _start(self, frame: Frame, detection: Detection | None, anchor: Float | None) -> Fused:
-        """Without a track, an anchor that the image supports starts one; the very first may start unsupported."""
+        """Without a track the anchor starts one; unless the image supports it, it only coasts."""
         if anchor is None:
             return Fused(None)
         refined = self._best_refined(frame, detection, [anchor])
-        return replace(_outcome(refined, anchor, None), gate_weight=1.0)
+        return replace(self._outcome(refined, anchor, None), gate_weight=1.0)
 
     def _agree(
         self,
@@ -120,27 +126,24 @@ class RefinedFusion:
         """Anchor and track share a basin: the better refinement, else the paper's fusion of the two."""
         track = self._best_refined(frame, detection, [anchor], track)
         between = fuse_two(anchor, confidence, predicted, self._fusion, self._alignment_config.lever_m_per_rad)
-        return replace(_outcome(track, between, predicted), gate_weight=1.0)
+        return replace(self._outcome(track, between, predicted), gate_weight=1.0)
 
     def _arbitrate(
         self, frame: Frame, detection: Detection | None, track: Refined | None, predicted: Float, anchor: Float
     ) -> Fused:
         """Anchor and track stand in different basins: weigh the evidence so far."""
+        self._n_disagreed += 1
         rival = self._best_refined(frame, detection, [anchor])
         lead = quality(rival) - quality(track)
         self._lead = lead if self._dissent.count == 1 else self._lead + lead
-        settled = self._n_agreed >= self._fusion.warmup_observations
-        needed = self._alignment_config.reset_anchors if settled else 1
+        needed = min(self._n_agreed + 1, self._alignment_config.reset_anchors)
         margin = self._refinement.arbitration_margin
-        takes_over = (
-            (rival is not None and track is None)
-            or self._lead >= margin
-            or (self._dissent.count >= needed and self._lead > -margin)
-        )
-        if not takes_over:
-            return replace(_outcome(track, predicted, predicted), gate_weight=self._fusion.gate_weight)
-        self._forget_rivals()
-        return replace(_outcome(rival, anchor, None), gate_weight=1.0, reset=True)
+        clearly_better = self._lead >= margin and self._is_supported(rival)
+        outnumbers = self._dissent.count >= needed and self._lead > -margin
+        if not (clearly_better or outnumbers):
+            return replace(self._outcome(track, predicted, predicted), gate_weight=self._fusion.gate_weight)
+        self._start_track()
+        return replace(self._outcome(rival, anchor, None), gate_weight=1.0, reset=True)
 
     def _forget_rivals(self) -> None:
         self._dissent.clear()
@@ -167,20 +170,36 @@ class RefinedFusion:
     def _best_refined(
         self, frame: Frame, detection: Detection | None, starts: list[Float], best: Refined | None = None
     ) -> Refined | None:
-        """The best supported refinement of the starts; one close to a pose already refined is not tried again."""
+        """The refinement with most evidence; a start close to a pose already refined is not tried, if supported."""
         for start in starts:
-            if best is not None:
+            if self._is_supported(best):
                 apart_rad = lie.angle_between(start[:3, :3], best.T_cam_target[:3, :3])
                 if apart_rad <= np.radians(self._refinement.same_pose_deg):
                     continue
             refined = self._refiner.refine(frame, detection, start)
-            if refined is not None and self._is_supported(refined) and quality(refined) > quality(best):
+            if quality(refined) > quality(best):
                 best = refined
         return best
 
-    def _is_supported(self, refined: Refined) -> bool:
+    def _is_supported(self, refined: Refined | None) -> bool:
+        if refined is None:
+            return False
         overlaps = np.isnan(refined.overlap) or refined.overlap >= self._refinement.min_overlap
         return bool(overlaps and refined.support >= self._refinement.min_support)
+
+    def _outcome(self, refined: Refined | None, otherwise: Float, predicted: Float | None) -> Fused:
+        """A supported refinement as a measurement, or another pose without one."""
+        if not self._is_supported(refined):
+            return Fused(otherwise, predicted)
+        T = refined.T_cam_target
+        certain = quality(refined) >= self._refinement.certain_quality or self._n_agreed > 0
+        return Fused(
+            T,
+            predicted,
+            measurement=T,
+            covariance=refined.covariance,
+            doubtful=not certain or self._n_disagreed > 1,
+        )
 
 
 def quality(refined: Refined | None) -> float:
@@ -191,11 +210,3 @@ def quality(refined: Refined | None) -> float:
     if refined is None:
         return 0.0
     return refined.support if np.isnan(refined.overlap) else 0.5 * (refined.support + refined.overlap)
-
-
-def _outcome(refined: Refined | None, otherwise: Float, predicted: Float | None) -> Fused:
-    """The refined pose as a measurement, or another pose without one."""
-    if refined is None:
-        return Fused(otherwise, predicted)
-    T = refined.T_cam_target
-    return Fused(T, predicted, measurement=T, covariance=refined.covariance)

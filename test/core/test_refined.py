@@ -167,6 +167,41 @@ def test_weak_evidence_is_no_measurement(scene, evidence):
     assert TrackState.TRACKING not in {e.state for e in estimates}
 
 
+def test_an_uncertain_start_is_tracking_only_after_a_second_anchor_agreed(scene):
+    estimates = _run(_stage(scene, lambda index: {"true": (0.8, 0.8)}), scene, range(30))
+    assert [e.state for e in estimates] == [TrackState.COASTING] * 8 + [TrackState.TRACKING] * 22
+    assert {e.gap_frames for e in estimates} == {0}
+    certain = _run(_stage(scene, lambda index: {"true": (0.95, 0.95)}), scene, range(30))
+    assert {e.state for e in certain} == {TrackState.TRACKING}
+
+
+def test_a_track_that_two_anchors_contradict_is_in_doubt_until_one_agrees(scene):
+    """Rivals without image support and without coherence: nothing to follow, but no certainty either."""
+    turns = {40: [np.pi, 0, 0], 48: [0, 0, np.pi]}
+
+    def anchor(i, T):
+        return lie.transform(T[:3, :3] @ lie.so3_exp(np.array(turns[i], float)), T[:3, 3]) if i in turns else T
+
+    estimates = _run(_stage(scene), scene, range(64), anchor)
+    doubt = [i for i, e in enumerate(estimates) if e.state != TrackState.TRACKING]
+    assert doubt == list(range(48, 56))
+    assert (_errors(estimates, scene, range(64)) < 1e-5).all()
+
+
+def test_a_rival_must_outnumber_the_anchors_behind_the_track(scene):
+    """Equal evidence: as many coherent rivals as anchors stood for the track, four at most."""
+
+    def equal(index):
+        return {"true": (0.9, 0.9), "flipped": (0.9, 0.9)}
+
+    for n_for in (1, 2, 3, 6):
+        estimates = _run(_stage(scene, equal), scene, range(120), lambda i, T, n=n_for: _flipped(T) if i < 8 * n else T)
+        errors = _errors(estimates, scene, range(120))
+        switched_at = 8 * n_for + 8 * (min(n_for, 4) - 1)
+        assert (errors[:switched_at] > 170).all()
+        assert (errors[switched_at:] < 1e-5).all()
+
+
 def test_a_box_without_silhouette_is_judged_by_the_contour_alone():
     refined = Refined(np.zeros(7), COVARIANCE, float("nan"), 0.7)
     assert quality(refined) == 0.7
