@@ -1,0 +1,63 @@
+"""The graph on a system with ROS 2 Jazzy installed: ``ros2 launch hat_ros hat.launch.py target:=cad.glb``.
+
+Every node configures and activates itself (``autostart``), so no lifecycle manager is needed. A node that dies is
+started again; the graph goes on in a new epoch.
+"""
+
+from launch.actions import DeclareLaunchArgument, GroupAction, SetEnvironmentVariable
+from launch.conditions import IfCondition
+from launch.substitutions import EnvironmentVariable, LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.substitutions import FindPackageShare
+
+from launch import LaunchDescription
+
+STAGES = ("segmentation", "hypotheses", "slam", "selector", "fusion")
+
+ARGUMENTS = (
+    ("config", "default", "preset or YAML file"),
+    ("target", "", "CAD model (obj, ply, stl, glb) or target.yaml"),
+    ("live", "true", "one frame in flight, the newest wins; false: nothing may be dropped"),
+    ("image", "/image", "topic of the rectified image"),
+    ("camera_info", "/camera_info", "topic of its calibration"),
+    ("overlay", "true", "offer /hat/overlay/compressed"),
+)
+
+
+def generate_launch_description() -> LaunchDescription:
+    arguments = [DeclareLaunchArgument(name, default_value=value, description=doc) for name, value, doc in ARGUMENTS]
+    profile = PathJoinSubstitution([FindPackageShare("hat_ros"), "config", "fastdds.xml"])
+    middleware = SetEnvironmentVariable(
+        "FASTRTPS_DEFAULT_PROFILES_FILE",
+        EnvironmentVariable("FASTRTPS_DEFAULT_PROFILES_FILE", default_value=profile),
+    )
+    parameters = [{name: LaunchConfiguration(name) for name in ("config", "target", "live")}]
+    image = LaunchConfiguration("image")
+    remappings = [
+        ("/image", image),
+        ("/image/compressed", [image, "/compressed"]),
+        ("/camera_info", LaunchConfiguration("camera_info")),
+    ]
+    stages = [
+        Node(
+            package="hat_ros",
+            executable=f"{name}_node",
+            name=name,
+            namespace="hat",
+            parameters=parameters,
+            remappings=remappings,
+            output="screen",
+            respawn=True,
+            respawn_delay=2.0,
+        )
+        for name in STAGES
+    ]
+    overlay = Node(
+        package="hat_ros",
+        executable="overlay_node",
+        name="overlay",
+        namespace="hat",
+        parameters=parameters,
+        condition=IfCondition(LaunchConfiguration("overlay")),
+    )
+    return LaunchDescription([*arguments, middleware, GroupAction([*stages, overlay])])
