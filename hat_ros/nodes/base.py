@@ -131,6 +131,15 @@ class HatNode(LifecycleNode):
             raw=raw,
         )
 
+    def has_input(self, topic: str) -> bool:
+        """Whether the topic is subscribed."""
+        return topic in self._inputs
+
+    def drop_input(self, topic: str) -> None:
+        """Unsubscribe."""
+        self.destroy_subscription(self._inputs.pop(topic))
+        del self._writers[topic]
+
     def guarded(self, callback: Callable[..., None], *args: Any) -> None:
         """Run a callback while active; an exception becomes a failure with one sentence."""
         if not self.active:
