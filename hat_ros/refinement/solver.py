@@ -21,8 +21,10 @@ NOISE_LEVEL = 4.0
 SCATTER_REF = 0.04
 # Neither masks nor edges are trusted beyond a quarter of a pixel.
 VARIANCE_FLOOR_PX2 = 0.0625
-# Contour length over which residuals err together, pixels: one independent sample each.
+# Contour length over which residuals err together, one independent sample each: pixels, and a share of the outline,
+# because shadows and misfits of the CAD model come in parts of the body.
 CORRELATION_PX = 8.0
+CORRELATION_SHARE = 0.03
 # Errors common to a whole outline, one sigma in pixels: a mask drawn too large, an exposure that blooms. They are
 # estimated along with the pose.
 MASK_BIAS_PX = 1.0
@@ -283,6 +285,9 @@ def fit_contour(
     shape = (N_PARAMETERS, N_PARAMETERS)
     H = np.zeros(shape)
     mask_bias, edge_bias = 0.0, 0.0
+    correlation = CORRELATION_PX
+    for i in range(n):
+        correlation += CORRELATION_SHARE * lines[i, 2]
     for iteration in range(len(reaches_px)):
         mask_sq, edge_sq = mask_scales_px[iteration] ** 2, edge_scales_px[iteration] ** 2
         reach = reaches_px[iteration]
@@ -329,8 +334,8 @@ def fit_contour(
             _accumulate(H_edge, g_edge, row, weight, residual)
             edge_sum += weight * residual * residual
             edge_weight += weight
-        mask_info = 1.0 / (_mean_square(mask_sum, mask_weight, VARIANCE_FLOOR_PX2) * CORRELATION_PX)
-        edge_info = 1.0 / (_mean_square(edge_sum, edge_weight, VARIANCE_FLOOR_PX2) * CORRELATION_PX)
+        mask_info = 1.0 / (_mean_square(mask_sum, mask_weight, VARIANCE_FLOOR_PX2) * correlation)
+        edge_info = 1.0 / (_mean_square(edge_sum, edge_weight, VARIANCE_FLOOR_PX2) * correlation)
         H = mask_info * H_mask + edge_info * H_edge
         g = mask_info * g_mask + edge_info * g_edge
         H[MASK_BIAS, MASK_BIAS] += 1.0 / MASK_BIAS_PX**2
