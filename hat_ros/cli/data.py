@@ -47,6 +47,7 @@ def _add_import(commands: Commands) -> None:
         help="give frames without a mask the box of the CAD at the true pose (as for SHIRT)",
     )
     parser.add_argument("--check", action="store_true", help="also write a picture of the CAD projected by the labels")
+    parser.add_argument("--renderer", choices=("embree", "pyrender"), default="embree", help="what draws that picture")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(command=_import)
 
@@ -64,6 +65,7 @@ def _import(arguments: argparse.Namespace) -> int:
             sequences=arguments.sequence,
             boxes=arguments.boxes,
             check=arguments.check,
+            renderer=arguments.renderer,
             progress=watch,
         )
     for bag in bags:

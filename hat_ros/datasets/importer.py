@@ -70,6 +70,7 @@ def import_dataset(
     sequences: Collection[str] = (),
     boxes: bool = False,
     check: bool = False,
+    renderer: str = "embree",
     progress: Progress | None = None,
 ) -> list[Path]:
     """Write bags: ``out`` itself for the ``sequence`` format, ``out/NAME`` per sequence otherwise.
@@ -81,6 +82,7 @@ def import_dataset(
         out: where to.
         boxes: give frames without a mask the box of the CAD at the true pose, see :func:`with_annotation_boxes`.
         check: also write ``NAME.check.png`` beside each bag, see :func:`check_picture`.
+        renderer: what draws it, see ``render.create_renderer``.
         progress: called with (sequence, frames done, frames in all).
 
     Returns:
@@ -99,7 +101,7 @@ def import_dataset(
         elif progress is not None:
             progress(recording.name, len(recording), len(recording))
         if check:
-            picture = check_picture(recording)
+            picture = check_picture(recording, renderer_name=renderer)
             cv2.imwrite(str(bag.with_name(f"{bag.name}.check.png")), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
         bags.append(bag)
     return bags
@@ -161,24 +163,27 @@ def with_annotation_boxes(recording: ImageRecording) -> ImageRecording:
     return replace(recording, files=files)
 
 
-def check_picture(recording: ImageRecording, width_px: int = 640) -> NDArray[np.uint8]:
-    """First, middle and last labelled frame with the CAD's outline at the true pose drawn in green: (H, W, 3) RGB.
+def check_picture(recording: ImageRecording, width_px: int = 640, renderer_name: str = "embree") -> NDArray[np.uint8]:
+    """First, middle and last labelled frame over the CAD rendered at the true pose, outlined in green: (H, W, 3) RGB.
 
-    Wrong units, quaternion order, frames or axes show at once: the outline misses the target.
+    Wrong units, quaternion order, frames or axes show at once: the outline misses the target. A mirrored or turned
+    model shows in the row below, which must look like the row above but for the light.
 
     Raises:
         DatasetError: the recording has no truth.
+        MissingDependencyError: see ``create_renderer``.
     """
     labelled = [item for item in recording.files if item.T_cam_target is not None]
     if not labelled:
         raise DatasetError(f"{recording.name}: no frame has a true pose, nothing to check")
-    renderer = create_renderer("embree", load_target(recording.target_path, recording.unit_scale))
-    tiles = []
+    renderer = create_renderer(renderer_name, load_target(recording.target_path, recording.unit_scale))
+    columns = []
     for item in (labelled[0], labelled[len(labelled) // 2], labelled[-1]):
         rgb = recording.frame(item).rgb.copy()
-        silhouette = renderer.render(item.T_cam_target, recording.camera, color=False).mask.astype(np.uint8)
-        contours, _ = cv2.findContours(silhouette, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        view = renderer.render(item.T_cam_target, recording.camera)
+        contours, _ = cv2.findContours(view.mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(rgb, contours, -1, (0, 255, 0), max(1, rgb.shape[1] // 640))
         height_px = round(rgb.shape[0] * width_px / rgb.shape[1])
-        tiles.append(cv2.resize(rgb, (width_px, height_px), interpolation=cv2.INTER_AREA))
-    return np.concatenate(tiles, axis=1)
+        both = np.concatenate([rgb, view.rgb])
+        columns.append(cv2.resize(both, (width_px, 2 * height_px), interpolation=cv2.INTER_AREA))
+    return np.concatenate(columns, axis=1)

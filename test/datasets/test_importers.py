@@ -452,7 +452,7 @@ def test_a_folder_that_is_no_bag_is_not_overwritten(sequence, tmp_path):
 def test_check_picture_draws_the_outline_and_needs_truth(sequence):
     recording = load_sequence(sequence)
     picture = check_picture(recording, width_px=160)
-    assert picture.shape == (120, 480, 3)
+    assert picture.shape == (240, 480, 3)
     assert ((picture == [0, 255, 0]).all(-1)).sum() > 50
     unlabelled = replace(recording, files=[replace(item, T_cam_target=None) for item in recording.files])
     with pytest.raises(DatasetError, match="nothing to check"):

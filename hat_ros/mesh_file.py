@@ -1,0 +1,140 @@
+"""Mesh files from others: what they declare is checked before a parser allocates anything (DESIGN section 7)."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import trimesh
+import yaml
+
+from hat_ros.errors import MeshError
+
+MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb")
+MAX_FILE_BYTES = 256 * 2**20
+MAX_FACES = 4_000_000
+MAX_VERTICES = 8_000_000
+MAX_NODES = 20_000
+
+
+def read_target_yaml(path: Path) -> tuple[Path, float, str]:
+    """Mesh file, metres per unit and name from a ``target.yaml``.
+
+    Raises:
+        MeshError: malformed, or the mesh does not lie beside it.
+    """
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise MeshError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
+    if not isinstance(data, dict) or not isinstance(data.get("mesh"), str):
+        raise MeshError(f"{path}: expected a mapping with the key 'mesh' naming a file beside it")
+    unknown = sorted(set(data) - {"mesh", "unit_scale", "name"})
+    if unknown:
+        raise MeshError(f"{path}: unknown key '{unknown[0]}', known keys are mesh, unit_scale, name")
+    scale = data.get("unit_scale", 1.0)
+    if isinstance(scale, bool) or not isinstance(scale, (int, float)):
+        raise MeshError(f"{path}: unit_scale must be a number, found {scale!r}")
+    mesh = (path.parent / data["mesh"]).resolve()
+    if path.parent.resolve() not in mesh.parents:
+        raise MeshError(f"{path}: mesh '{data['mesh']}' must lie in the same folder")
+    if mesh.suffix.lower() not in MESH_SUFFIXES:
+        raise MeshError(f"{path}: mesh '{data['mesh']}' must be one of {', '.join(MESH_SUFFIXES)}")
+    return mesh, float(scale), str(data.get("name", mesh.stem))
+
+
+def read_scene(path: Path) -> trimesh.Scene:
+    """A mesh file as ``trimesh`` reads it, after the checks of this module.
+
+    Raises:
+        MeshError: missing, another format, too large, or not readable as what it claims to be.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        raise MeshError(f"CAD model {path.name}: format '{suffix}' is not supported, give {', '.join(MESH_SUFFIXES)}")
+    if not path.is_file():
+        raise MeshError(f"CAD model {path}: no such file")
+    size = path.stat().st_size
+    if not 0 < size <= MAX_FILE_BYTES:
+        raise MeshError(f"CAD model {path.name}: the file has {size} bytes, expected 1 to {MAX_FILE_BYTES}")
+    {".glb": _check_glb, ".ply": _check_ply, ".stl": _check_text_or_size, ".obj": _check_text_or_size}[suffix](path)
+    try:
+        scene = trimesh.load_scene(path, file_type=suffix[1:], process=False)
+    except Exception as error:  # parsers raise whatever the broken bytes lead them to
+        raise MeshError(
+            f"CAD model {path.name}: not a readable {suffix[1:]} file ({type(error).__name__}: {_short(error)})"
+        ) from None
+    _check_scene(scene, path.name)
+    return scene
+
+
+def _short(error: Exception) -> str:
+    return " ".join(str(error).split())[:160]
+
+
+def _check_scene(scene: trimesh.Scene, name: str) -> None:
+    """Count what the scene graph would expand to before expanding it: instances multiply."""
+    nodes = scene.graph.nodes_geometry
+    if len(nodes) > MAX_NODES:
+        raise MeshError(f"CAD model {name}: {len(nodes)} placed parts, at most {MAX_NODES} are accepted")
+    meshes = [scene.geometry[scene.graph[node][1]] for node in nodes]
+    meshes = [mesh for mesh in meshes if isinstance(mesh, trimesh.Trimesh)]
+    n_faces = sum(len(mesh.faces) for mesh in meshes)
+    if n_faces > MAX_FACES:
+        raise MeshError(f"CAD model {name}: {n_faces} triangles, at most {MAX_FACES} are accepted; simplify it")
+
+
+def _check_text_or_size(path: Path) -> None:
+    """OBJ and STL declare little: refuse archives in disguise and a binary STL longer than its file."""
+    with path.open("rb") as file:
+        head = file.read(84)
+    if head[:4] in (b"PK\x03\x04", b"\x1f\x8b\x08\x00", b"7z\xbc\xaf") or head[:2] == b"\x1f\x8b":
+        raise MeshError(f"CAD model {path.name}: it is an archive, not a {path.suffix[1:]} file; unpack it first")
+    if path.suffix.lower() == ".stl" and not head.lstrip().lower().startswith(b"solid") and len(head) == 84:
+        declared = struct.unpack("<I", head[80:])[0]
+        if 84 + 50 * declared != path.stat().st_size:
+            raise MeshError(f"CAD model {path.name}: the STL header says {declared} triangles, the file's size differs")
+
+
+def _check_ply(path: Path) -> None:
+    with path.open("rb") as file:
+        head = file.read(65536)
+    if not head.startswith(b"ply") or b"end_header" not in head:
+        raise MeshError(f"CAD model {path.name}: it does not start with a PLY header")
+    for line in head.split(b"end_header")[0].splitlines():
+        words = line.split()
+        if len(words) == 3 and words[0] == b"element":
+            count = int(words[2]) if words[2].isdigit() else -1
+            # The smallest element that carries anything takes a byte.
+            if not 0 <= count <= path.stat().st_size:
+                raise MeshError(
+                    f"CAD model {path.name}: the PLY header declares {words[2].decode('ascii', 'replace')} "
+                    f"'{words[1].decode('ascii', 'replace')}' elements, more than the file can hold"
+                )
+
+
+def _check_glb(path: Path) -> None:
+    """What the JSON chunk declares must fit the file: sparse accessors and shared nodes can declare gigabytes."""
+    with path.open("rb") as file:
+        head = file.read(20)
+        if len(head) < 20 or head[:4] != b"glTF" or head[16:20] != b"JSON":
+            raise MeshError(f"CAD model {path.name}: it is not a binary glTF 2.0 (GLB) file")
+        version, _, json_bytes = struct.unpack("<III", head[4:16])
+        if version != 2 or json_bytes > path.stat().st_size:
+            raise MeshError(f"CAD model {path.name}: GLB version {version} or a truncated header; export as glTF 2.0")
+        try:
+            tree = json.loads(file.read(json_bytes))
+        except (ValueError, RecursionError):
+            raise MeshError(f"CAD model {path.name}: its GLB header is not valid JSON") from None
+    if not isinstance(tree, dict):
+        raise MeshError(f"CAD model {path.name}: its GLB header is not a mapping")
+    try:
+        declared = sum(int(accessor["count"]) for accessor in tree.get("accessors", []))
+        children = [child for node in tree.get("nodes", []) for child in node.get("children", [])]
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise MeshError(f"CAD model {path.name}: its GLB header is malformed") from None
+    if declared > MAX_VERTICES * 4:
+        raise MeshError(f"CAD model {path.name}: its header declares {declared} values, more than is accepted")
+    if len(children) != len(set(map(str, children))) or len(tree.get("nodes", [])) > MAX_NODES:
+        raise MeshError(f"CAD model {path.name}: its scene graph is not a tree of at most {MAX_NODES} nodes")
