@@ -6,6 +6,7 @@ bytes. Clocks are read here, never inside a stage.
 
 from __future__ import annotations
 
+import resource
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -30,7 +31,7 @@ from hat_ros.tracker import Step
 from hat_ros.types import Frame
 
 STAGE_NAMES = ("segmentation", "hypotheses", "motion", "selector", "fusion")
-MEASURED = ("latency_ms", "cpu_ms", "decode_ms", *(f"{name}_ms" for name in STAGE_NAMES), "mask_iou")
+MEASURED = ("latency_ms", "cpu_ms", "decode_ms", *(f"{name}_ms" for name in STAGE_NAMES), "rss_mib", "mask_iou")
 # First frames left out of throughput and latency: compiled code is loaded and caches are filled there.
 WARMUP_FRAMES = 10
 
@@ -46,6 +47,7 @@ class Processed:
         cpu_ms: processor time of the step, all threads together.
         decode_ms: wall time of reading and decoding the frame before it.
         stage_ms: wall time by stage.
+        rss_mib: resident memory of this process after the step.
         mask_iou: overlap of the detected and the recorded silhouette, NaN when none was recorded.
     """
 
@@ -55,11 +57,12 @@ class Processed:
     cpu_ms: float
     decode_ms: float
     stage_ms: dict[str, float]
+    rss_mib: float
     mask_iou: float
 
     def measured(self) -> tuple[float, ...]:
         """The values of :data:`MEASURED`, in order."""
-        return (self.latency_ms, self.cpu_ms, self.decode_ms, *self.stage_ms.values(), self.mask_iou)
+        return (self.latency_ms, self.cpu_ms, self.decode_ms, *self.stage_ms.values(), self.rss_mib, self.mask_iou)
 
 
 class StageClock:
@@ -136,7 +139,7 @@ class Pipeline:
         iou = float("nan")
         if frame.given_mask is not None and (silhouette := frame.given_mask == 255).any():
             iou = mask_iou(None if step.detection is None else step.detection.mask, silhouette)
-        return Processed(frame, step, latency_ms, cpu_ms, decode_ms, self._clock.take(), iou)
+        return Processed(frame, step, latency_ms, cpu_ms, decode_ms, self._clock.take(), resident_mib(), iou)
 
 
 @dataclass(frozen=True)
@@ -201,6 +204,26 @@ def open_source(path: str | Path) -> Source:
     if bag.target_path is None:
         raise BagError(f"{path} has no target.yaml: put the CAD model and a target.yaml that names it into the folder")
     return Source(path, bag, load_target(bag.target_path))
+
+
+def resident_mib() -> float:
+    """Resident memory of this process in MiB; NaN where the system does not say."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    except (OSError, ValueError, IndexError):
+        return float("nan")
+    return pages * resource.getpagesize() / 2**20
+
+
+def memory_summary(rows: list[tuple[float, ...]]) -> dict[str, float]:
+    """How much resident memory grew from the first to the last quarter of a run: medians over rows of MEASURED."""
+    rss_mib = np.array([row[MEASURED.index("rss_mib")] for row in rows])
+    quarter = len(rss_mib) // 4
+    if quarter == 0:
+        return {"memory_growth_mib": float("nan")}
+    # The first quarter begins after warm-up: caches fill there by design.
+    first = rss_mib[min(WARMUP_FRAMES, quarter) :][:quarter]
+    return {"memory_growth_mib": float(np.median(rss_mib[-quarter:]) - np.median(first))}
 
 
 def latency_summary(rows: list[tuple[float, ...]]) -> dict[str, float]:

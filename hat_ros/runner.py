@@ -19,7 +19,7 @@ from hat_ros.evaluation.folder import complete_folder
 from hat_ros.evaluation.metrics import mask_summary
 from hat_ros.evaluation.score import write_json
 from hat_ros.methods import create_method
-from hat_ros.pipeline import MEASURED, WARMUP_FRAMES, Pipeline, Source, latency_summary, open_source
+from hat_ros.pipeline import MEASURED, WARMUP_FRAMES, Pipeline, Source, latency_summary, memory_summary, open_source
 from hat_ros.provenance import describe_run
 from hat_ros.result_bag import ResultBagWriter
 from hat_ros.results import RUN_FILE, LiveTables, ResultFolder, write_config
@@ -193,6 +193,8 @@ def _result_folder(folder: ResultFolder, recording: Path, config: HatConfig, how
             if isinstance(error, OSError):
                 reason = error.strerror or type(error).__name__
                 raise RunError(f"the run stopped ({reason}); what was done is in {folder.path}") from None
+            if isinstance(error, RunError):
+                raise type(error)(f"{error}; what was done is in {folder.path}") from None
             raise
 
 
@@ -224,4 +226,4 @@ def _run(
             bag.write_context(source.recording.camera, source.truth_rows())
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     overlap = np.array([row[MEASURED.index("mask_iou")] for row in rows])
-    return latency_summary(rows) | mask_summary(overlap) | {"peak_memory_mib": peak_mib}
+    return latency_summary(rows) | mask_summary(overlap) | {"peak_memory_mib": peak_mib} | memory_summary(rows)

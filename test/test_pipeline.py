@@ -7,7 +7,15 @@ from scripted import CAMERA, ScriptedMethod, frame, mask, stamp
 from hat_ros.bag import BagWriter
 from hat_ros.datasets.models import write_model
 from hat_ros.errors import BagError, FrameError, UsageError
-from hat_ros.pipeline import MEASURED, WARMUP_FRAMES, Pipeline, latency_summary, open_source
+from hat_ros.pipeline import (
+    MEASURED,
+    WARMUP_FRAMES,
+    Pipeline,
+    latency_summary,
+    memory_summary,
+    open_source,
+    resident_mib,
+)
 
 
 def run(frames, masks_given=False):
@@ -54,13 +62,20 @@ def test_box_masks_are_no_silhouette_to_judge_by():
 
 
 def test_latency_leaves_out_warm_up_and_counts_decoding_in_fps():
-    slow = (1000.0, 900.0, 0.0, *([0.0] * 5), np.nan)
-    fast = (8.0, 7.0, 2.0, 1.0, 2.0, 3.0, 0.5, 1.5, np.nan)
+    slow = (1000.0, 900.0, 0.0, *([0.0] * 5), 100.0, np.nan)
+    fast = (8.0, 7.0, 2.0, 1.0, 2.0, 3.0, 0.5, 1.5, 100.0, np.nan)
     summary = latency_summary([slow] * WARMUP_FRAMES + [fast] * 50)
     assert summary["fps"] == pytest.approx(100.0)
     assert summary["latency_ms_p50"] == summary["latency_ms_p99"] == pytest.approx(8.0)
     assert summary["motion_ms_mean"] == pytest.approx(3.0)
     assert len(fast) == len(MEASURED)
+
+
+def test_memory_growth_compares_quarters():
+    rows = [(0.0,) * 8 + (100.0 + (i >= 60) * 5.0, np.nan) for i in range(80)]
+    assert memory_summary(rows)["memory_growth_mib"] == pytest.approx(5.0)
+    assert np.isnan(memory_summary(rows[:3])["memory_growth_mib"])
+    assert 1.0 < resident_mib() < 1e5
 
 
 def test_latency_of_nothing_is_nan():

@@ -39,6 +39,7 @@ _FIGURES = (
     Column("latency_ms_p99", "p99 ms", ".1f"),
     Column("cpu_ms_mean", "cpu ms", ".1f"),
     Column("peak_memory_mib", "MiB", ".0f"),
+    Column("memory_growth_mib", "+MiB", ".1f"),
 )
 _STAGES = (
     Column("fps", "fps", ".1f"),
