@@ -122,8 +122,8 @@ class FeatureSlamConfig:
     iterations: int = option(4, "bundle adjustment steps per frame", low=1, high=50)
     sigma_px: float = option(1.0, "standard deviation of a track: errors persist, so more than its jitter", low=0.01)
     cutoff_px: float = option(1.0, "scale of the redescending loss on tracks, px", low=0.1)
-    turn_acceleration_deg_s2: float = option(3.0, "standard deviation of the angular acceleration", low=1e-3)
-    move_acceleration_radii_s2: float = option(2.0, "of the linear acceleration, in apparent target radii", low=1e-3)
+    turn_acceleration_deg_s2: float = option(1.0, "least standard deviation of the angular acceleration", low=1e-3)
+    move_acceleration_radii_s2: float = option(0.5, "of the linear acceleration, in target radii", low=1e-3)
     use_prior: bool = option(True, "let healthy priors bring CAD depth and rotation (needs prior.enabled)")
     surface_sigma: float = option(0.03, "uncertainty of CAD depth, share of the target's bounding radius", low=1e-3)
     prior_turn_sigma_deg: float = option(0.5, "uncertainty of a fused rotation relative to others", low=0.01)
@@ -238,6 +238,7 @@ class RefinementConfig:
     min_overlap: float = option(0.6, "silhouette overlap with the mask that a supported pose needs", low=0, high=1)
     min_support: float = option(0.4, "share of the contour that must agree with the image", low=0, high=1)
     same_pose_deg: float = option(5.0, "a start this close to a refined pose is not refined once more", low=0, high=180)
+    switch_margin: float = option(0.05, "lead in image evidence that a second start within a basin needs", low=0)
     arbitration_margin: float = option(0.15, "summed lead in image evidence that decides between basins", low=0)
     certain_quality: float = option(0.9, "image evidence that needs no second anchor to be TRACKING", low=0, high=1)
 

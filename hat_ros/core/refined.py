@@ -76,8 +76,9 @@ class RefinedFusion:
         fused = self._decide(frame, detection, predictions, anchor, confidence)
         if fused.reset:
             self.alignment.reset()
-            self._measured.clear()
         if fused.measurement is not None:
+            if self._jumps(fused):
+                self._measured.clear()
             self._measured.append((frame.stamp_ns, fused.measurement))
             if anchor is not None and motion.valid:
                 self.alignment.observe(fused.measurement, motion.T_slam_cam)
@@ -93,7 +94,7 @@ class RefinedFusion:
         anchor: Float | None,
         confidence: float,
     ) -> Fused:
-        track = self._best_refined(frame, detection, predictions)
+        track = self._best_refined(frame, detection, predictions, lead=self._refinement.switch_margin)
         if not predictions:
             return self._start(frame, detection, anchor)
         predicted = predictions[0]
@@ -168,18 +169,33 @@ class RefinedFusion:
         return out or [output]
 
     def _best_refined(
-        self, frame: Frame, detection: Detection | None, starts: list[Float], best: Refined | None = None
+        self,
+        frame: Frame,
+        detection: Detection | None,
+        starts: list[Float],
+        best: Refined | None = None,
+        lead: float = 0.0,
     ) -> Refined | None:
-        """The refinement with most evidence; a start close to a pose already refined is not tried, if supported."""
+        """The refinement with most evidence; a later start must lead by ``lead`` over a supported pose to replace it.
+
+        Starts close to a supported pose are not tried: they would end there.
+        """
         for start in starts:
             if self._is_supported(best):
                 apart_rad = lie.angle_between(start[:3, :3], best.T_cam_target[:3, :3])
                 if apart_rad <= np.radians(self._refinement.same_pose_deg):
                     continue
             refined = self._refiner.refine(frame, detection, start)
-            if quality(refined) > quality(best):
+            if quality(refined) > quality(best) + (lead if self._is_supported(best) else 0.0):
                 best = refined
         return best
+
+    def _jumps(self, fused: Fused) -> bool:
+        """The measurement left the pose that the past predicted: earlier poses tell no rate."""
+        if fused.predicted is None:
+            return True
+        apart_rad = lie.angle_between(fused.measurement[:3, :3], fused.predicted[:3, :3])
+        return bool(apart_rad > np.radians(2.0 * self._refinement.same_pose_deg))
 
     def _is_supported(self, refined: Refined | None) -> bool:
         if refined is None:
