@@ -10,23 +10,15 @@ import resource
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hat_ros import lie
-from hat_ros.bag import BagReader, deserialize
 from hat_ros.core.sync import Admission
-from hat_ros.datasets import Recording
-from hat_ros.datasets.sequence import load_sequence
-from hat_ros.errors import BagError, FrameError, UsageError
+from hat_ros.errors import FrameError
 from hat_ros.evaluation.metrics import mask_iou
 from hat_ros.methods import Method
-from hat_ros.nodes.images import decode_image, decode_mask
-from hat_ros.target import Target, load_target
 from hat_ros.tracker import Step
 from hat_ros.types import Frame
 
@@ -140,70 +132,6 @@ class Pipeline:
         if frame.given_mask is not None and (silhouette := frame.given_mask == 255).any():
             iou = mask_iou(None if step.detection is None else step.detection.mask, silhouette)
         return Processed(frame, step, latency_ms, cpu_ms, decode_ms, self._clock.take(), resident_mib(), iou)
-
-
-@dataclass(frozen=True)
-class Source:
-    """A recording that was opened, with its target."""
-
-    path: Path
-    recording: Recording | BagReader
-    target: Target
-
-    def frames(self, start: int = 0, limit: int | None = None) -> Iterator[Frame | FrameError]:
-        """Frames from number ``start`` on, at most ``limit`` of them; a malformed one comes as its error."""
-        stop = None if limit is None else start + limit
-        attempts = _attempts(self.recording) if isinstance(self.recording, BagReader) else self.recording.frames(stop)
-        return islice(attempts, start, stop)
-
-    def count(self, start: int = 0, limit: int | None = None) -> int:
-        """How many frames :meth:`frames` brings."""
-        rest = max(0, len(self.recording) - start)
-        return rest if limit is None else min(rest, limit)
-
-    @property
-    def frame_id(self) -> str:
-        """``header.frame_id`` of the images."""
-        return self.recording.frame_id if isinstance(self.recording, BagReader) else "camera"
-
-    def truth_rows(self) -> dict[int, NDArray[np.float64]]:
-        """Stamp -> true pose row (7,), empty when unknown."""
-        if isinstance(self.recording, BagReader):
-            return self.recording.truth_rows()
-        return {stamp: lie.row_from_matrix(T) for stamp, T in self.recording.truth().items()}
-
-
-def _attempts(bag: BagReader) -> Iterator[Frame | FrameError]:
-    """The frames of a bag; one that cannot be decoded does not end the stream."""
-    for packet in bag.packets():
-        kind = f"sensor_msgs/msg/{'CompressedImage' if packet.compressed else 'Image'}"
-        try:
-            rgb = decode_image(deserialize(packet.image, kind, bag.path))
-            mask = packet.mask and decode_mask(deserialize(packet.mask, "sensor_msgs/msg/Image", bag.path))
-            yield Frame(packet.stamp_ns, rgb, bag.camera, mask)
-        except FrameError as error:
-            yield error
-
-
-def open_source(path: str | Path) -> Source:
-    """Open a bag or a folder of the ``sequence`` layout, and the CAD model beside it.
-
-    Raises:
-        UsageError: there is nothing of that name, or it is neither.
-        InputError: it is malformed, or no CAD model lies beside it.
-    """
-    path = Path(path)
-    if not path.exists():
-        raise UsageError(f"recording {path}: no such file or folder")
-    if (path / "labels.json").is_file():
-        sequence = load_sequence(path)
-        return Source(path, sequence, load_target(sequence.target_path, sequence.unit_scale))
-    if path.suffix != ".mcap" and not (path / "metadata.yaml").is_file():
-        raise UsageError(f"recording {path}: neither a bag (metadata.yaml) nor a sequence folder (labels.json)")
-    bag = BagReader(path)
-    if bag.target_path is None:
-        raise BagError(f"{path} has no target.yaml: put the CAD model and a target.yaml that names it into the folder")
-    return Source(path, bag, load_target(bag.target_path))
 
 
 def resident_mib() -> float:
