@@ -46,11 +46,6 @@ def _add_import(commands: Commands) -> None:
     )
     parser.add_argument("--check", action="store_true", help="also write a picture of the CAD projected by the labels")
     parser.add_argument("--renderer", choices=("embree", "pyrender"), default="embree", help="what draws that picture")
-    parser.add_argument(
-        "--link",
-        action="store_true",
-        help="write no bags but OUT/NAME/dataset.yaml, which `hat track` and `hat bench` read like a bag",
-    )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(command=_import)
 
@@ -58,19 +53,7 @@ def _add_import(commands: Commands) -> None:
 def _import(arguments: argparse.Namespace) -> int:
     from hat_ros.cli.console import count_progress
     from hat_ros.datasets.importer import import_dataset
-    from hat_ros.datasets.link import write_links
 
-    if arguments.link:
-        links = write_links(
-            arguments.format,
-            arguments.source,
-            arguments.out,
-            model=arguments.model,
-            sequences=arguments.sequence,
-            boxes=arguments.boxes,
-        )
-        print("\n".join(map(str, links)))
-        return 0
     with count_progress(arguments.quiet) as watch:
         bags = import_dataset(
             arguments.format,

@@ -15,7 +15,6 @@ from hat_ros.datasets import spark
 from hat_ros.datasets.bop import open_bop
 from hat_ros.datasets.image_files import camera_from_label, stamp_of
 from hat_ros.datasets.importer import check_picture, import_dataset, open_dataset, with_annotation_boxes
-from hat_ros.datasets.link import open_link, write_links
 from hat_ros.datasets.sequence import load_sequence, write_labels
 from hat_ros.errors import DatasetError, MeshError, UsageError
 from hat_ros.target import load_target
@@ -465,33 +464,3 @@ def test_principal_point_counted_from_the_corner_is_moved_to_pixel_centres(cx, e
     matrix = K.copy()
     matrix[:2, 2] = cx, 60.0
     assert camera_from_label(matrix, (160, 120), "test").K[0, 2] == expected
-
-
-# ---------------------------------------------------------------- links
-
-
-def test_a_link_opens_the_sequence_where_it_lies(shirt_root, tmp_path):
-    model = save_mesh(tmp_path / "cad.ply")
-    links = write_links("shirt", shirt_root, tmp_path / "links", model=model, boxes=True)
-    assert [link.name for link in links] == ["roe1_synthetic", "roe1_lightbox", "roe2_synthetic", "roe2_lightbox"]
-    linked = open_link(links[3])
-    direct = next(iter(open_dataset("shirt", shirt_root, model, ["roe2_lightbox"])))
-    for a, b in zip(linked.frames(), direct.frames(), strict=True):
-        np.testing.assert_array_equal(a.rgb, b.rgb)
-        assert a.given_mask is not None and b.given_mask is None
-    assert write_links("shirt", shirt_root, tmp_path / "links", model=model, boxes=True) == links
-
-
-def test_a_link_to_changed_or_missing_data_is_refused(shirt_root, tmp_path):
-    model = save_mesh(tmp_path / "cad.ply")
-    link = write_links("shirt", shirt_root, tmp_path / "links", model=model)[0]
-    labels = shirt_root / "roe1" / "roe1.json"
-    labels.write_text(labels.read_text().replace("5.5", "5.4"))
-    with pytest.raises(DatasetError, match="changed since"):
-        open_link(link)
-    (link / "dataset.yaml").write_text("format: shirt\n")
-    with pytest.raises(DatasetError, match="expected exactly the keys"):
-        open_link(link)
-    (tmp_path / "mine" / "roe1_synthetic").mkdir(parents=True)
-    with pytest.raises(UsageError, match="not a link"):
-        write_links("shirt", shirt_root, tmp_path / "mine", model=model)
