@@ -122,7 +122,7 @@ class FeatureSlamConfig:
     iterations: int = option(4, "bundle adjustment steps per frame", low=1, high=50)
     sigma_px: float = option(1.0, "standard deviation of a track: errors persist, so more than its jitter", low=0.01)
     cutoff_px: float = option(1.0, "scale of the redescending loss on tracks, px", low=0.1)
-    turn_acceleration_deg_s2: float = option(1.0, "least standard deviation of the angular acceleration", low=1e-3)
+    turn_acceleration_deg_s2: float = option(1.0, "standard deviation of the angular acceleration", low=1e-3)
     move_acceleration_radii_s2: float = option(0.5, "of the linear acceleration, in target radii", low=1e-3)
     use_prior: bool = option(True, "let healthy priors bring CAD depth and rotation (needs prior.enabled)")
     surface_sigma: float = option(0.03, "uncertainty of CAD depth, share of the target's bounding radius", low=1e-3)

@@ -1,0 +1,1 @@
+"""Target-relative motion: the stage and its backends."""

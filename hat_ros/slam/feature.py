@@ -28,10 +28,12 @@ _WRONG_PX, _WRONG_FRAMES = 3.0, 3
 # Frames in a row without an answer after which a new epoch starts.
 _LOST_FRAMES = 3
 # Depth of the first points: a bulge of this share of the radius towards the camera, known to this share.
-_FIRST_BULGE, _FIRST_SIGMA = 0.5, 0.5
+_FIRST_BULGE, _FIRST_SIGMA = 0.5, 10.0
 # Later points start at the depth of this many neighbours, known to this share of the relief.
-_NEIGHBOURS, _NEIGHBOUR_SIGMA = 5, 0.5
+_NEIGHBOURS, _NEIGHBOUR_SIGMA = 5, 10.0
 _NEIGHBOUR_SOFTENING_PX = 5.0
+# A camera that moves about a static scene, often in a hand, accelerates this much more than a body tumbling in space.
+_CAMERA_AGILITY = 30.0
 # Rival solutions are tried every so many frames: the mirror image, and the CAD's when it disagrees this much.
 _RIVAL_PERIOD = 5
 _MIN_SURFACE_AGREEMENT = 0.7
@@ -106,8 +108,8 @@ class FeatureSlam:
         center = self._normalise(np.array([cols.mean(), rows.mean()]))
         focal = float(np.sqrt(self._camera.K[0, 0] * self._camera.K[1, 1]))
         radius = float(np.sqrt(len(rows) / np.pi) / focal)
-        self._window = Window(self._config, stamp_ns, center, radius)
-        self._window.focal = focal
+        agility = 1.0 if self._masked else _CAMERA_AGILITY
+        self._window = Window(self._config, stamp_ns, center, radius, focal, agility)
         z = np.ones(len(slots))
         if self._masked:
             z -= _FIRST_BULGE * radius * (bulge(region, self._tracks.xy[slots]) - 0.5)
@@ -206,4 +208,4 @@ def bulge(region: Image, xy: Float) -> Float:
 
 
 def _same_camera(a: Camera, b: Camera) -> bool:
-    return a is b or (a.width, a.height) == (b.width, b.height) and np.array_equal(a.K, b.K)
+    return a is b or ((a.width, a.height) == (b.width, b.height) and np.array_equal(a.K, b.K))

@@ -134,10 +134,12 @@ class SurfacePrior:
 
 def robust_mean_rotation(R: Float) -> Float:
     """Mean of (n, 3, 3) rotations that outliers do not move: from the medoid, reweighted chordal means."""
-    angle = lie.rotation_angle(R[:, None] @ np.swapaxes(R, 1, 2)[None])
-    mean = R[int(np.argmin(np.minimum(angle, 3 * _GAUGE_CUTOFF_RAD).sum(axis=1)))]
+    flat = R.reshape(len(R), 9)
+    # The squared chordal distance 3 - tr(A B^T) is the squared angle, for small ones.
+    apart_sq = 3.0 - flat @ flat.T
+    mean = R[int(np.argmin(np.minimum(apart_sq, (3 * _GAUGE_CUTOFF_RAD) ** 2).sum(axis=1)))]
     for _ in range(3):
-        weight = (1.0 + (lie.angle_between(R, mean) / _GAUGE_CUTOFF_RAD) ** 2) ** -2
+        weight = (1.0 + (3.0 - flat @ mean.reshape(9)) / _GAUGE_CUTOFF_RAD**2) ** -2
         u, _, vt = np.linalg.svd(np.einsum("n,nij->ij", weight, R))
         mean = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     return mean

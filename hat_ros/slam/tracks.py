@@ -24,6 +24,8 @@ _BACKWARD_TOLERANCE_PX = 0.4
 _CROP_PAD_PX = 32
 # Weakest corner accepted, as a share of the strongest (Shi and Tomasi's smaller eigenvalue).
 _CORNER_QUALITY = 0.004
+# New corners are looked for once this share of the slots is free.
+_WORTHWHILE_SHARE = 0.05
 
 
 class PointTracks:
@@ -68,6 +70,8 @@ class PointTracks:
         """Fill free slots with new corners; returns the slots filled."""
         self._image = image
         free = np.flatnonzero(~self.alive)
+        if len(free) < _WORTHWHILE_SHARE * len(self.alive):
+            return free[:0]
         corners = detect(image, region, self.xy[self.alive], len(free), self._spacing_px)
         slots = free[: len(corners)]
         self.xy[slots] = corners
@@ -126,8 +130,11 @@ def detect(image: Image, region: Image, taken: Float, count: int, spacing_px: fl
     if min(width, height) < _WINDOW_PX // 2 or count <= 0:
         return np.zeros((0, 2))
     free = region[y : y + height, x : x + width].copy()
-    for u, v in np.rint(taken).astype(int).tolist():
-        cv2.circle(free, (u - x, v - y), max(1, round(spacing_px)), 0, -1)
+    blocked = np.zeros(free.shape, np.uint8)
+    col, row = np.clip(np.rint(taken).astype(int) - [x, y], 0, [width - 1, height - 1]).T
+    blocked[row, col] = 1
+    side = 2 * max(1, round(spacing_px)) + 1
+    free[cv2.dilate(blocked, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))) > 0] = 0
     crop = np.ascontiguousarray(image[y : y + height, x : x + width])
     corners = cv2.goodFeaturesToTrack(crop, count, _CORNER_QUALITY, spacing_px, mask=free, blockSize=5)
     if corners is None:

@@ -29,6 +29,8 @@ _WIDE_CUTOFF_PX = 6.0
 _PREDICTION_SLACK = 3.0
 # One-sigma turn (rad) and move (radii) of a second frame, about which nothing is known.
 _FIRST_TURN_RAD, _FIRST_MOVE_RADII = 0.35, 1.0
+# The structure of an epoch younger than this is a guess, so its tracks cannot be told from outliers yet.
+_YOUNG_FRAMES = 10
 # A rival solution must be this much cheaper, relative and absolute, to take over.
 _RIVAL_SHARE, _RIVAL_MARGIN = 0.9, 20.0
 _RIVAL_ITERATIONS = 8
@@ -43,6 +45,8 @@ class Window:
         stamp_ns: first frame.
         center_xn: (2,) normalised image coordinates of the target's centre.
         radius: apparent radius of the target in normalised coordinates, equal to SLAM units at the start.
+        focal: pixels per unit of normalised coordinates.
+        agility: factor on the accelerations of the constant-rate prior.
 
     Attributes:
         stamps_ns, number: of the W frames, oldest first; ``number`` counts frames of the epoch.
@@ -54,11 +58,19 @@ class Window:
         cost: of the last adjustment; covariance: (12, 12) of the last two poses.
     """
 
-    def __init__(self, config: FeatureSlamConfig, stamp_ns: int, center_xn: Float, radius: float) -> None:
+    def __init__(
+        self,
+        config: FeatureSlamConfig,
+        stamp_ns: int,
+        center_xn: Float,
+        radius: float,
+        focal: float,
+        agility: float = 1.0,
+    ) -> None:
         n = config.max_points
         self._config = config
         self.radius = radius
-        self.focal = 1.0
+        self.focal = focal
         self.stamps_ns = [stamp_ns]
         self.number = [0]
         self.R = np.eye(3)[None].copy()
@@ -71,6 +83,10 @@ class Window:
         self.n_surface = np.zeros(n, dtype=np.int64)
         self.R_expected = np.eye(3)[None].copy()
         self.R_info = np.zeros(1)
+        # Standard deviations of the accelerations, rad/s^2 and units/s^2.
+        self._acceleration = agility * np.array(
+            [np.radians(config.turn_acceleration_deg_s2), config.move_acceleration_radii_s2 * radius]
+        )
         self.cost = 0.0
         self.covariance = np.full((12, 12), np.inf)
 
@@ -101,8 +117,7 @@ class Window:
         if len(self) < 2:
             turn, move = _FIRST_TURN_RAD, _FIRST_MOVE_RADII * self.radius
         else:
-            turn = _PREDICTION_SLACK * np.radians(self._config.turn_acceleration_deg_s2) * dt * dt
-            move = _PREDICTION_SLACK * self._config.move_acceleration_radii_s2 * self.radius * dt * dt
+            turn, move = _PREDICTION_SLACK * self._acceleration * dt * dt
         R, t = R0, t0
         for cutoff_px in (_WIDE_CUTOFF_PX, self._config.cutoff_px):
             R, t, residual_px = refine_pose(
@@ -150,8 +165,14 @@ class Window:
             setattr(self, name, np.delete(getattr(self, name), k, axis=0))
 
     def adjust(self) -> None:
-        """Bundle-adjust the window."""
-        self.cost, self.covariance = adjust_window(self.R, self.t, self.X, self._problem(), self._config.iterations)
+        """Bundle-adjust the window; while it is young, from a wide loss to a narrow one."""
+        self.cost, self.covariance = self._descend(self.R, self.t, self.X, self._problem(), self._config.iterations)
+
+    def _descend(self, R: Float, t: Float, X: Float, problem: Problem, n_iterations: int) -> tuple[float, Float]:
+        if self.number[-1] <= _YOUNG_FRAMES:
+            for factor in (8.0, 4.0, 2.0):
+                adjust_window(R, t, X, problem._replace(cutoff_px=factor * problem.cutoff_px), n_iterations)
+        return adjust_window(R, t, X, problem, n_iterations)
 
     def try_mirror(self) -> bool:
         """Whether the depth-reversed solution fits better; if so it takes over.
@@ -188,7 +209,7 @@ class Window:
     def _try(self, R: Float, t: Float, X: Float, X_expected: Float) -> bool:
         R, t = np.ascontiguousarray(R), np.ascontiguousarray(t)
         problem = self._problem()._replace(X_expected=X_expected)
-        cost, covariance = adjust_window(R, t, X, problem, _RIVAL_ITERATIONS)
+        cost, covariance = self._descend(R, t, X, problem, _RIVAL_ITERATIONS)
         if cost > _RIVAL_SHARE * self.cost - _RIVAL_MARGIN:
             return False
         self.R, self.t, self.X, self.X_expected = R, t, X, X_expected
@@ -215,8 +236,7 @@ class Window:
         dt = np.diff(seconds, prepend=-1.0)
         rate_info = np.zeros((len(self), 2))
         span = 0.5 * (dt[1:-1] + dt[2:])
-        rate_info[1:-1, 0] = (np.radians(self._config.turn_acceleration_deg_s2) * span) ** -2
-        rate_info[1:-1, 1] = (self._config.move_acceleration_radii_s2 * self.radius * span) ** -2
+        rate_info[1:-1] = (self._acceleration * span[:, None]) ** -2
         return Problem(
             self.xn, self.seen, self.focal, self._config.sigma_px, self._config.cutoff_px, self.X_expected, self.X_info,
             self.R_expected, self.R_info, dt, rate_info, self.R[0].copy(), self.t[0].copy(), _GAUGE_INFO,
