@@ -58,11 +58,11 @@ def input_hash(path: Path) -> str:
     return digest.hexdigest()
 
 
-def describe_run(source: Path, config: HatConfig, **more: Any) -> dict[str, Any]:
+def describe_run(source: Path, source_sha256: str, config: HatConfig, **more: Any) -> dict[str, Any]:
     """Contents of ``run.json``: source and its hash, configuration hash, code, versions, machine."""
     return {
         "source": str(source.resolve()),
-        "source_sha256": input_hash(source),
+        "source_sha256": source_sha256,
         "config_sha256": config_hash(config),
         "code": code_version(),
         "code_sha256": code_hash(),

@@ -19,10 +19,11 @@ from hat_ros.evaluation.folder import complete_folder
 from hat_ros.evaluation.metrics import mask_summary
 from hat_ros.evaluation.score import write_json
 from hat_ros.methods import create_method
-from hat_ros.pipeline import MEASURED, WARMUP_FRAMES, Pipeline, Source, latency_summary, memory_summary, open_source
+from hat_ros.pipeline import MEASURED, WARMUP_FRAMES, Pipeline, latency_summary, memory_summary
 from hat_ros.provenance import describe_run
 from hat_ros.result_bag import ResultBagWriter
 from hat_ros.results import RUN_FILE, LiveTables, ResultFolder, write_config
+from hat_ros.source import Source, SourceSpec
 from hat_ros.tracker import Step
 from hat_ros.types import TrackState
 
@@ -56,11 +57,11 @@ class TrackOptions:
     overwrite: bool = False
 
 
-def track(path: Path, out: Path, config: HatConfig, options: TrackOptions, watch: Watcher | None = None) -> Path:
+def track(spec: SourceSpec, out: Path, config: HatConfig, options: TrackOptions, watch: Watcher | None = None) -> Path:
     """Run a method over a recording and write its result folder.
 
     Args:
-        path: bag or sequence folder.
+        spec: the recording.
         out: result folder to be.
         config: configuration of all stages.
         options: see :class:`TrackOptions`.
@@ -74,11 +75,11 @@ def track(path: Path, out: Path, config: HatConfig, options: TrackOptions, watch
         RunError: the run stopped half-way; what was done is in ``<out>.partial``.
     """
     folder = ResultFolder(out, options.overwrite)
-    source = open_source(path)
+    source = spec.open()
     method = create_method(options.mode, config, source.target)
     pipeline = Pipeline(method, config.segmentation.backend in GIVEN_MASK_BACKENDS)
     how = {"mode": options.mode, "start": options.start, "limit": options.limit}
-    with _result_folder(folder, path, config, how):
+    with _result_folder(folder, spec, config, how):
         measured = _run(pipeline, source, folder, options, watch)
         complete_folder(folder.path, source, measured, video=options.video, report=options.report)
     return folder.final_path
@@ -135,7 +136,8 @@ def replay_bag(
             f"or use `hat track`, which needs none"
         ) from None
     folder = ResultFolder(out, options.overwrite)
-    source = open_source(path)
+    spec = SourceSpec(path)
+    source = spec.open()
     if not isinstance(source.recording, BagReader):
         raise UsageError(f"{path} is no bag: `hat import sequence {path} --out BAG` makes one, `hat track` needs none")
     clock: list[float] = []
@@ -147,7 +149,7 @@ def replay_bag(
             watch(now.done, now.total, now.status.estimate.state)
 
     how = {"mode": "hat", "graph": options.graph, "live": options.live, "start": options.start, "limit": options.limit}
-    with _result_folder(folder, path, config, how):
+    with _result_folder(folder, spec, config, how):
         result = graph.replay(
             path,
             config,
@@ -180,11 +182,12 @@ def _measured_by(result: ReplayResult, clock: list[float]) -> dict[str, Any]:
 
 
 @contextmanager
-def _result_folder(folder: ResultFolder, recording: Path, config: HatConfig, how: dict[str, Any]) -> Iterator[None]:
+def _result_folder(folder: ResultFolder, spec: SourceSpec, config: HatConfig, how: dict[str, Any]) -> Iterator[None]:
     """A result folder around a run; one that stops leaves tables and metrics of what was done in ``*.partial``."""
     with folder:
         write_config(folder.path, config)
-        write_json(folder.path / RUN_FILE, describe_run(recording, config, **how))
+        where = {"dataset": spec.dataset, "sequence": spec.sequence, "model": spec.model and str(spec.model.resolve())}
+        write_json(folder.path / RUN_FILE, describe_run(spec.path, spec.sha256(), config, **where, **how))
         try:
             yield
         except BaseException as error:

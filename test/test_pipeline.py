@@ -13,9 +13,9 @@ from hat_ros.pipeline import (
     Pipeline,
     latency_summary,
     memory_summary,
-    open_source,
     resident_mib,
 )
+from hat_ros.source import open_source
 
 
 def run(frames, masks_given=False):

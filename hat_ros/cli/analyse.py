@@ -5,9 +5,13 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from hat_ros.cli.options import Commands, add_config, natural, positive
+from hat_ros.cli.options import Commands, add_config, add_dataset, natural, positive
 from hat_ros.cli.run import MODES
+
+if TYPE_CHECKING:
+    from hat_ros.source import SourceSpec
 
 
 def add_commands(commands: Commands) -> None:
@@ -62,6 +66,15 @@ def _plot(arguments: argparse.Namespace) -> int:
 
 
 def _add_campaign(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "recordings",
+        nargs="*",
+        metavar="SEQ",
+        help="bag or sequence folder; SEQ@key=value[,key=value] gives one clip settings of its own (bench)",
+    )
+    add_dataset(parser)
+    parser.add_argument("--root", type=Path, metavar="DIR", help="root folder of the --dataset; no bags are written")
+    parser.add_argument("--sequence", action="append", default=[], metavar="NAME", help="only this one (repeatable)")
     parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="campaign folder; resumed if it exists")
     add_config(parser)
     parser.add_argument("--limit", type=positive, metavar="N", help="at most N frames per run")
@@ -71,6 +84,21 @@ def _add_campaign(parser: argparse.ArgumentParser) -> None:
         metavar="ADDRESS",
         help="run on the workers of this Dask scheduler instead (extra `cluster`; shared file system)",
     )
+
+
+def _clips(arguments: argparse.Namespace) -> list[tuple[SourceSpec, tuple[str, ...]]]:
+    """The recordings that the arguments name."""
+    from hat_ros.errors import UsageError
+    from hat_ros.evaluation.bench import clips_named, clips_of_dataset
+
+    if bool(arguments.dataset) != (arguments.root is not None):
+        raise UsageError("--dataset and --root belong together: name the layout and the folder of the data set")
+    clips = clips_named(arguments.recordings)
+    if arguments.dataset:
+        clips += clips_of_dataset(arguments.dataset, arguments.root, arguments.model, arguments.sequence)
+    if not clips:
+        raise UsageError("nothing to run: name bags or sequence folders, or a --dataset and its --root")
+    return clips
 
 
 def _names(*known: str) -> argparse.Action:
@@ -96,19 +124,13 @@ def _add_bench(commands: Commands) -> None:
         "table as text, CSV, LaTeX, JSON and PNG. Runs that are done already, with the same inputs, "
         "configuration and code, are used again.",
     )
-    parser.add_argument(
-        "recordings",
-        nargs="+",
-        metavar="SEQ",
-        help="bag or sequence folder; SEQ@key=value[,key=value] gives one clip settings of its own",
-    )
     _add_campaign(parser)
     parser.add_argument(
         "--modes",
-        type=_names(*MODES),
+        type=_names(*MODES, "graph"),
         default=["hat", "independent"],
         metavar="LIST",
-        help=f"methods, from {','.join(MODES)} (default: hat,independent)",
+        help=f"methods, from {','.join(MODES)} and graph (bags through ROS) (default: hat,independent)",
     )
     parser.add_argument(
         "--masks",
@@ -136,7 +158,7 @@ def _bench(arguments: argparse.Namespace) -> int:
     from hat_ros.evaluation.figures import image_bytes
 
     jobs = bench.bench_jobs(
-        arguments.recordings,
+        _clips(arguments),
         arguments.modes,
         arguments.masks,
         arguments.start,
@@ -147,12 +169,15 @@ def _bench(arguments: argparse.Namespace) -> int:
     out = arguments.out.resolve()
     with campaign_progress(len(jobs)) as watch:
         outcomes = run_campaign(jobs, out, arguments.jobs, arguments.scheduler, watch)
-    table, stages = bench.bench_table(outcomes), bench.stage_table(outcomes)
-    table.write(out, "table")
-    stages.write(out, "stages")
+    table, stages, groups = bench.bench_table(outcomes), bench.stage_table(outcomes), bench.group_table(outcomes)
+    for name, written in (("table", table), ("stages", stages), ("groups", groups)):
+        written.write(out, name)
     for form in ("png", "svg"):
         (out / f"bench.{form}").write_bytes(image_bytes(bench_figure(table.rows), form))
+        if groups.rows:
+            (out / f"groups.{form}").write_bytes(image_bytes(bench_figure(groups.rows, "group"), form))
     print(table.text())
+    print(groups.text())
     if arguments.stages:
         print(stages.text())
     failures = bench.failures(outcomes)
@@ -169,7 +194,6 @@ def _add_ablate(commands: Commands) -> None:
         "the paper's ablations. --config decides the temporal settings; --front-end, if given, takes segmentation, "
         "hypotheses and motion (and the scale of the appearance score) from another preset.",
     )
-    parser.add_argument("recordings", nargs="+", type=Path, metavar="SEQ", help="bag or sequence folder, with truth")
     _add_campaign(parser)
     parser.add_argument("--front-end", metavar="NAME|FILE", help="preset of the front ends (default: that of --config)")
     parser.set_defaults(command=_ablate)
@@ -181,9 +205,8 @@ def _ablate(arguments: argparse.Namespace) -> int:
     from hat_ros.evaluation.campaign import run_campaign
 
     out = arguments.out.resolve()
-    plan = ablate.plan(
-        arguments.recordings, out, arguments.config, arguments.front_end, arguments.overrides, arguments.limit
-    )
+    clips = [spec for spec, _ in _clips(arguments)]
+    plan = ablate.plan(clips, out, arguments.config, arguments.front_end, arguments.overrides, arguments.limit)
     with campaign_progress(len(plan.jobs)) as watch:
         outcomes = run_campaign(plan.jobs, out, arguments.jobs, arguments.scheduler, watch)
     for name, table in ablate.tables(plan, outcomes).items():

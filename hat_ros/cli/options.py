@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from hat_ros.config import HatConfig
 
+FORMATS = ("sequence", "spark", "shirt", "swisscube", "bop")
+
 Commands = Any  # argparse's sub-parser action has no public name
 
 
@@ -42,6 +44,18 @@ def add_out(parser: argparse.ArgumentParser, what: str) -> None:
     """``--out`` and ``--overwrite``."""
     parser.add_argument("--out", required=True, type=Path, metavar="DIR", help=what)
     parser.add_argument("--overwrite", action="store_true", help="replace what an earlier run left in DIR")
+
+
+def add_dataset(parser: argparse.ArgumentParser) -> None:
+    """``--dataset`` and ``--model``."""
+    parser.add_argument(
+        "--dataset",
+        choices=FORMATS,
+        default="",
+        metavar="FORMAT",
+        help=f"the recording is a sequence of a data set as published: {', '.join(FORMATS)}",
+    )
+    parser.add_argument("--model", type=Path, metavar="CAD", help="metric CAD model, for data sets that bring none")
 
 
 def add_threads(parser: argparse.ArgumentParser) -> None:

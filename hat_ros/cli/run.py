@@ -5,7 +5,17 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hat_ros.cli.options import Commands, add_config, add_out, add_threads, config_of, limit_threads, natural, positive
+from hat_ros.cli.options import (
+    Commands,
+    add_config,
+    add_dataset,
+    add_out,
+    add_threads,
+    config_of,
+    limit_threads,
+    natural,
+    positive,
+)
 
 MODES = ("hat", "independent", "tracking", "offline", "observe")
 
@@ -79,7 +89,9 @@ def _add_track(commands: Commands) -> None:
         description="Run the method over a bag or a sequence folder in this process and write a result folder. "
         "Gives the same bytes as `hat replay`.",
     )
-    parser.add_argument("recording", type=Path, help="bag, or folder of the `sequence` layout")
+    parser.add_argument("recording", type=Path, help="bag, folder of the `sequence` layout, or root of a data set")
+    add_dataset(parser)
+    parser.add_argument("--sequence", default="", metavar="NAME", help="which sequence of the data set")
     add_out(parser, "result folder to write")
     add_config(parser)
     parser.add_argument(
@@ -98,8 +110,13 @@ def _add_track(commands: Commands) -> None:
 def _track(arguments: argparse.Namespace) -> int:
     limit_threads(arguments.threads)
     from hat_ros.cli.console import print_figures, state_progress
+    from hat_ros.errors import UsageError
     from hat_ros.runner import TrackOptions, track
+    from hat_ros.source import SourceSpec
 
+    if bool(arguments.dataset) != bool(arguments.sequence):
+        raise UsageError("track: --dataset and --sequence belong together: name the layout and one of its sequences")
+    spec = SourceSpec(arguments.recording, arguments.dataset, arguments.sequence, arguments.model)
     options = TrackOptions(
         mode=arguments.mode,
         start=arguments.start,
@@ -109,7 +126,7 @@ def _track(arguments: argparse.Namespace) -> int:
         overwrite=arguments.overwrite,
     )
     with state_progress("tracking", arguments.quiet) as watch:
-        folder = track(arguments.recording, arguments.out, config_of(arguments), options, watch)
+        folder = track(spec, arguments.out, config_of(arguments), options, watch)
     if not arguments.quiet:
         print_figures(folder)
     return 0

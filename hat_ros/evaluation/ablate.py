@@ -23,6 +23,7 @@ from hat_ros.evaluation.tables import Column, Table
 from hat_ros.evaluation.temporal_replay import replay_offline, replay_temporal
 from hat_ros.result_bag import read_result_bag
 from hat_ros.results import BAG_FOLDER, CONFIG_FILE, write_config
+from hat_ros.source import SourceSpec
 
 # No rotation disagrees by more: the gate is off.
 GATE_OFF_DEG = 180.0
@@ -78,7 +79,7 @@ class Plan:
 
 
 def plan(
-    recordings: Sequence[Path],
+    clips: Sequence[SourceSpec],
     out: Path,
     config: str,
     front_end: str | None = None,
@@ -88,7 +89,7 @@ def plan(
     """Merge the configurations, write the result to ``out/config.yaml``, and list the runs.
 
     Args:
-        recordings: clips with truth.
+        clips: recordings with truth.
         out: campaign folder.
         config: preset or file of the temporal settings.
         front_end: preset or file of segmentation, hypotheses and motion; None = that of ``config``.
@@ -97,7 +98,7 @@ def plan(
 
     Raises:
         ConfigError: a configuration is bad.
-        UsageError: a recording does not exist, or two have the same name.
+        UsageError: two recordings have the same name.
         RunError: ``out`` cannot be written.
     """
     merged = load_config(config, overrides)
@@ -112,21 +113,18 @@ def plan(
             refinement=front.refinement,
             selector=replace(merged.selector, score_scale=front.selector.score_scale),
         )
-    for path in recordings:
-        if not path.exists():
-            raise UsageError(f"recording {path}: no such file or folder")
-    if len({path.resolve().name for path in recordings}) < len(recordings):
-        raise UsageError("two recordings have the same name: rename one of the folders")
+    if len({spec.name for spec in clips}) < len(clips):
+        raise UsageError("two recordings have the same name: rename one of them")
     try:
         out.mkdir(parents=True, exist_ok=True)
         write_config(out, merged)
     except OSError as error:
         raise RunError(f"cannot write {out}: {error.strerror}") from None
     jobs = []
-    for path in (path.resolve() for path in recordings):
+    for spec in clips:
         for kind, mode, settings in _RUNS:
-            labels = {"clip": path.name, "kind": kind}
-            jobs.append(Job(f"{path.name}-{kind}", path, mode, str(out / CONFIG_FILE), settings, 0, limit, labels))
+            labels = {"clip": spec.name, "kind": kind}
+            jobs.append(Job(f"{spec.name}-{kind}", spec, mode, str(out / CONFIG_FILE), settings, 0, limit, labels))
     return Plan(merged, jobs)
 
 

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from hat_ros.datasets.importer import open_dataset
 from hat_ros.errors import UsageError
+from hat_ros.evaluation import metrics
 from hat_ros.evaluation.campaign import Job, Outcome
 from hat_ros.evaluation.tables import Column, Table
+from hat_ros.source import SourceSpec
 
 GIVEN_MASKS = ("segmentation.backend=annotated",)
 
@@ -53,8 +59,39 @@ _STAGES = (
 )
 
 
+def clips_named(texts: Sequence[str]) -> list[tuple[SourceSpec, tuple[str, ...]]]:
+    """Recordings with settings of their own: ``CLIP`` or ``CLIP@key=value[,key=value]``.
+
+    Raises:
+        UsageError: there is no such file or folder.
+    """
+    clips = []
+    for text in texts:
+        path, settings = Path(text), ()
+        if not path.exists() and "@" in text:
+            name, _, rest = text.rpartition("@")
+            path, settings = Path(name), tuple(rest.split(","))
+        if not path.exists():
+            raise UsageError(f"recording {path}: no such file or folder")
+        clips.append((SourceSpec(path.resolve()), settings))
+    return clips
+
+
+def clips_of_dataset(
+    dataset: str, root: Path, model: Path | None, sequences: Sequence[str]
+) -> list[tuple[SourceSpec, tuple[str, ...]]]:
+    """The sequences of a data set as published, without writing bags.
+
+    Raises:
+        UsageError, DatasetError: see :func:`hat_ros.datasets.importer.open_dataset`.
+    """
+    root, model = root.resolve(), model and model.resolve()
+    names = [recording.name for recording in open_dataset(dataset, root, model, sequences)]
+    return [(SourceSpec(root, dataset, name, model), ()) for name in names]
+
+
 def bench_jobs(
-    recordings: Sequence[str],
+    clips: Sequence[tuple[SourceSpec, tuple[str, ...]]],
     modes: Sequence[str],
     masks: Sequence[str],
     starts: Sequence[int],
@@ -65,7 +102,7 @@ def bench_jobs(
     """The runs of a benchmark, clip by clip.
 
     Args:
-        recordings: bags or sequence folders; ``CLIP@key=value[,key=value]`` gives one clip settings of its own.
+        clips: recordings, each with settings of its own.
         modes: methods.
         masks: ``own`` (the preset's segmentation) and/or ``given`` (the recording's masks).
         starts: cold-start offsets in frames.
@@ -74,31 +111,20 @@ def bench_jobs(
         limit: at most this many frames per run.
 
     Raises:
-        UsageError: a recording does not exist, or two have the same name.
+        UsageError: two clips have the same name.
     """
     jobs: dict[str, Job] = {}
-    for text in recordings:
-        path, own_settings = _split_settings(text)
+    for spec, own_settings in clips:
         for mask in masks:
             for start in starts:
                 for mode in modes:
-                    name = f"{path.name}-{mode}-{mask}-{start}"
+                    name = f"{spec.name}-{mode}-{mask}-{start}"
                     if name in jobs:
-                        raise UsageError(f"two recordings are called {path.name}: rename one of the folders")
+                        raise UsageError(f"two recordings are called {spec.name}: rename one of them")
                     settings = (*overrides, *own_settings, *(GIVEN_MASKS if mask == "given" else ()))
-                    labels = {"clip": path.name, "masks": mask, "start": str(start), "mode": mode}
-                    jobs[name] = Job(name, path, mode, config, settings, start, limit, labels)
+                    labels = {"group": spec.group, "clip": spec.name, "masks": mask, "start": str(start), "mode": mode}
+                    jobs[name] = Job(name, spec, mode, config, settings, start, limit, labels)
     return list(jobs.values())
-
-
-def _split_settings(text: str) -> tuple[Path, tuple[str, ...]]:
-    path, settings = Path(text), ()
-    if not path.exists() and "@" in text:
-        name, _, rest = text.rpartition("@")
-        path, settings = Path(name), tuple(rest.split(","))
-    if not path.exists():
-        raise UsageError(f"recording {path}: no such file or folder")
-    return path.resolve(), settings
 
 
 def bench_table(outcomes: Sequence[Outcome]) -> Table:
@@ -109,6 +135,58 @@ def bench_table(outcomes: Sequence[Outcome]) -> Table:
 def stage_table(outcomes: Sequence[Outcome]) -> Table:
     """Mean time per frame by stage; a stage that runs at keyframes only is averaged over all frames."""
     return Table("Time per frame by stage", (*_WHERE, *_STAGES), _rows(outcomes))
+
+
+def group_table(outcomes: Sequence[Outcome]) -> Table:
+    """Figures per group (data set, or folder of clips): errors pooled over all frames, speed over all time."""
+    keys = ("group", "masks", "start", "mode")
+    groups: dict[tuple[str, ...], list[Outcome]] = {}
+    for outcome in outcomes:
+        if outcome.figures is not None:
+            groups.setdefault(tuple(outcome.job.labels[key] for key in keys), []).append(outcome)
+    rows = [{**dict(zip(keys, group, strict=True)), **_pooled(members)} for group, members in groups.items()]
+    columns = (
+        Column("group", "group"),
+        *_WHERE[1:],
+        Column("clips", "clips", "d"),
+        Column("targets", "frames", "d"),
+        *(column for column in _FIGURES if column.key in _POOLED),
+    )
+    return Table("Benchmark by group", columns, rows)
+
+
+_POOLED = {
+    "E_p_mean",
+    "E_p_sd",
+    "E_t_m_mean",
+    "E_t_m_sd",
+    "E_q_deg_mean",
+    "E_q_deg_sd",
+    "E_q_over_90_share",
+    "coverage",
+    "fps",
+}
+
+
+def _pooled(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    errors = np.vstack([_frame_errors(outcome.folder) for outcome in outcomes])
+    targets = sum(outcome.figures["targets"] for outcome in outcomes)
+    seconds = [outcome.figures["frames"] / fps for outcome in outcomes if (fps := outcome.figures.get("fps"))]
+    frames = sum(outcome.figures["frames"] for outcome in outcomes if outcome.figures.get("fps"))
+    return {
+        **metrics.summarise(metrics.PoseErrors(errors[:, 0], np.radians(errors[:, 1]), errors[:, 2])),
+        "clips": len(outcomes),
+        "targets": targets,
+        "coverage": sum(outcome.figures["valid"] for outcome in outcomes) / targets if targets else None,
+        "fps": frames / sum(seconds) if seconds else None,
+    }
+
+
+def _frame_errors(folder: Path) -> np.ndarray:
+    """(N, 3) E_t in metres, E_q in degrees, E_p of every frame of a run; NaN where there is none."""
+    with (folder / "poses.csv").open(newline="", encoding="utf-8") as file:
+        rows = [[row["E_t_m"], row["E_q_deg"], row["E_p"]] for row in csv.DictReader(file)]
+    return np.array([[float(cell) if cell else np.nan for cell in row] for row in rows]).reshape(-1, 3)
 
 
 def failures(outcomes: Sequence[Outcome]) -> list[str]:

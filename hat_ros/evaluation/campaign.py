@@ -20,11 +20,15 @@ from typing import Any
 
 from hat_ros.config import load_config
 from hat_ros.errors import RunError
-from hat_ros.provenance import code_hash, config_hash, input_hash
+from hat_ros.provenance import code_hash, config_hash
 from hat_ros.results import METRICS_FILE, RUN_FILE
+from hat_ros.source import SourceSpec
 
 # One thread per run: timings are comparable, and N jobs use N cores.
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+GRAPH = "graph"
 
 
 @dataclass(frozen=True)
@@ -33,8 +37,8 @@ class Job:
 
     Attributes:
         name: unique within the campaign; the run's folder.
-        recording: bag or sequence folder.
-        mode: method.
+        spec: the recording.
+        mode: method, or ``graph``: HAT through the five-node ROS graph.
         config: preset name or YAML file.
         overrides: ``key=value`` settings on top of it.
         start: frames skipped.
@@ -43,7 +47,7 @@ class Job:
     """
 
     name: str
-    recording: Path
+    spec: SourceSpec
     mode: str = "hat"
     config: str = "default"
     overrides: tuple[str, ...] = ()
@@ -54,19 +58,25 @@ class Job:
     def fingerprint(self) -> dict[str, Any]:
         """What ``run.json`` of this run must hold."""
         return {
-            "source_sha256": _input_hash(self.recording),
+            "source_sha256": _sha256(self.spec),
             "config_sha256": config_hash(load_config(self.config, self.overrides)),
             "code_sha256": code_hash(),
-            "mode": self.mode,
+            "mode": "hat" if self.mode == GRAPH else self.mode,
             "start": self.start,
             "limit": self.limit,
         }
 
     def command(self, folder: Path) -> list[str]:
         """The command line that makes ``folder``."""
-        command = [sys.executable, "-m", "hat_ros.cli", "track", str(self.recording), "--out", str(folder)]
-        command += ["--mode", self.mode, "--config", self.config, "--start", str(self.start), "--threads", "1"]
+        command = [sys.executable, "-m", "hat_ros.cli", "replay" if self.mode == GRAPH else "track"]
+        command += [str(self.spec.path), "--out", str(folder), "--config", self.config, "--start", str(self.start)]
         command += ["--no-video", "--no-report", "--quiet", "--overwrite"]
+        if self.mode != GRAPH:
+            command += ["--mode", self.mode, "--threads", "1"]
+        if self.spec.dataset:
+            command += ["--dataset", self.spec.dataset, "--sequence", self.spec.sequence]
+        if self.spec.model is not None:
+            command += ["--model", str(self.spec.model)]
         if self.limit is not None:
             command += ["--limit", str(self.limit)]
         for override in self.overrides:
@@ -86,8 +96,8 @@ class Outcome:
 
 
 @cache
-def _input_hash(path: Path) -> str:
-    return input_hash(path)
+def _sha256(spec: SourceSpec) -> str:
+    return spec.sha256()
 
 
 def run_campaign(

@@ -16,9 +16,9 @@ from hat_ros.evaluation.overlay import OverlayPainter, VideoFile
 from hat_ros.evaluation.report import write_report
 from hat_ros.evaluation.runlog import RunLog
 from hat_ros.evaluation.score import score_run, write_json
-from hat_ros.pipeline import Source, open_source
 from hat_ros.result_bag import read_result_bag
 from hat_ros.results import BAG_FOLDER, CONFIG_FILE, METRICS_FILE, RUN_FILE, write_tables
+from hat_ros.source import Source, SourceSpec, open_source
 from hat_ros.types import Frame, TrackState
 
 # Overlay frames shown in the report.
@@ -108,7 +108,9 @@ def read_folder(folder: Path) -> tuple[dict[str, Any], dict[str, Any], str]:
 def _source_of(run: dict[str, Any]) -> Source | None:
     """The recording that a run was made from, None when it is no longer there."""
     try:
-        return open_source(run["source"])
+        model = run.get("model")
+        spec = SourceSpec(Path(run["source"]), run.get("dataset", ""), run.get("sequence", ""), model and Path(model))
+        return spec.open()
     except HatError:
         return None
 

@@ -13,6 +13,7 @@ from hat_ros.evaluation import ablate
 from hat_ros.evaluation.filters import FilterNoise, ParticleSelector, UkfSelector
 from hat_ros.evaluation.runlog import RunLogBuilder
 from hat_ros.evaluation.temporal_replay import keyframes_of, replay_offline, replay_temporal
+from hat_ros.source import SourceSpec
 from hat_ros.temporal import Observations, run_temporal
 from hat_ros.types import Candidates, Estimate, Motion, TrackState
 
@@ -159,11 +160,11 @@ def test_plan_merges_presets_and_refuses_bad_ones(tmp_path):
     temporal, front = tmp_path / "temporal.yaml", tmp_path / "front.yaml"
     temporal.write_text("fusion: {gate_angle_deg: 75.0}\nselector: {score_scale: 3.0}\n")
     front.write_text("hypotheses: {max_candidates: 5}\nselector: {score_scale: 0.5}\nfusion: {gate_angle_deg: 1.0}\n")
-    plan = ablate.plan([clip], tmp_path / "out", str(temporal), str(front))
+    plan = ablate.plan([SourceSpec(clip)], tmp_path / "out", str(temporal), str(front))
     assert plan.config.fusion.gate_angle_deg == 75.0
     assert (plan.config.hypotheses.max_candidates, plan.config.selector.score_scale) == (5, 0.5)
     assert {job.mode for job in plan.jobs} == {"observe", "tracking"}
     with pytest.raises(ConfigError, match="fusion"):
-        ablate.plan([clip], tmp_path / "out", str(temporal), overrides=["fusion.nope=1"])
-    with pytest.raises(UsageError, match="no such file"):
-        ablate.plan([tmp_path / "none"], tmp_path / "out", str(temporal))
+        ablate.plan([SourceSpec(clip)], tmp_path / "out", str(temporal), overrides=["fusion.nope=1"])
+    with pytest.raises(UsageError, match="same name"):
+        ablate.plan([SourceSpec(clip), SourceSpec(clip)], tmp_path / "out", str(temporal))

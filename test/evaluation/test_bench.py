@@ -11,7 +11,7 @@ from hat_ros.bag import BagWriter
 from hat_ros.datasets.models import write_model
 from hat_ros.errors import MissingDependencyError, UsageError
 from hat_ros.evaluation import campaign
-from hat_ros.evaluation.bench import bench_jobs, bench_table, failures, stage_table
+from hat_ros.evaluation.bench import bench_jobs, bench_table, clips_named, failures, group_table, stage_table
 from hat_ros.evaluation.campaign import Job, run_campaign
 from hat_ros.results import METRICS_FILE, RUN_FILE
 
@@ -48,7 +48,9 @@ def fake_runs(monkeypatch):
         folder.mkdir(parents=True, exist_ok=True)
         job = next(job for job in jobs_by_name.values() if job.name == folder.name)
         (folder / RUN_FILE).write_text(json.dumps(job.fingerprint()))
-        figures = {"frames": 3, "valid": 3, "E_p_mean": len(log) / 10, "fps": 20.0 + len(log), "coverage": 1.0}
+        figures = {"frames": 3, "targets": 3, "valid": 2, "E_p_mean": len(log) / 10, "fps": 20.0 + len(log)}
+        errors = "E_t_m,E_q_deg,E_p\n0.1,2.0,0.05\n0.3,4.0,0.15\n,,\n"
+        (folder / "poses.csv").write_text(errors)
         (folder / METRICS_FILE).write_text(json.dumps(figures))
         return Done(0, "")
 
@@ -60,13 +62,14 @@ def fake_runs(monkeypatch):
 def make(clips, registry, **options):
     settings = {"modes": ["hat", "independent"], "masks": ["own"], "starts": [0]} | options
     settings.setdefault("config", str(Path(clips[0]).parent / "settings.yaml"))
-    jobs = bench_jobs(clips, **settings)
+    jobs = bench_jobs(clips_named(clips), **settings)
     registry.update({job.name: job for job in jobs})
     return jobs
 
 
 def test_jobs_cover_every_combination_once(clips):
-    jobs = bench_jobs(clips, ["hat", "independent"], ["own", "given"], [0, 60], "default", ["keyframes.gap_frames=3"])
+    named, modes, masks = clips_named(clips), ["hat", "independent"], ["own", "given"]
+    jobs = bench_jobs(named, modes, masks, [0, 60], "default", ["keyframes.gap_frames=3"])
     assert len(jobs) == len({job.name for job in jobs}) == 2 * 2 * 2 * 2
     given = [job for job in jobs if job.labels["masks"] == "given"]
     assert all("segmentation.backend=annotated" in job.overrides for job in given)
@@ -75,18 +78,17 @@ def test_jobs_cover_every_combination_once(clips):
 
 
 def test_one_clip_may_have_settings_of_its_own(clips):
-    jobs = bench_jobs(
-        [clips[0], f"{clips[1]}@slam.masked=false,keyframes.gap_frames=2"], ["hat"], ["own"], [0], "default"
-    )
+    named = clips_named([clips[0], f"{clips[1]}@slam.masked=false,keyframes.gap_frames=2"])
+    jobs = bench_jobs(named, ["hat"], ["own"], [0], "default")
     assert jobs[0].overrides == ()
     assert jobs[1].overrides == ("slam.masked=false", "keyframes.gap_frames=2")
 
 
 def test_missing_or_ambiguous_clips_are_refused(clips, tmp_path):
     with pytest.raises(UsageError, match="no such file"):
-        bench_jobs([str(tmp_path / "three")], ["hat"], ["own"], [0], "default")
+        bench_jobs(clips_named([str(tmp_path / "three")]), ["hat"], ["own"], [0], "default")
     with pytest.raises(UsageError, match="two recordings are called one"):
-        bench_jobs([clips[0], clips[0]], ["hat"], ["own"], [0], "default")
+        bench_jobs(clips_named([clips[0], clips[0]]), ["hat"], ["own"], [0], "default")
 
 
 def test_killed_and_resumed_campaign_gives_the_same_table_byte_for_byte(clips, fake_runs, tmp_path, monkeypatch):
@@ -111,7 +113,7 @@ def test_killed_and_resumed_campaign_gives_the_same_table_byte_for_byte(clips, f
     again = run_campaign(jobs, out, n_jobs=3)
     assert len(log) == len(jobs)
     assert all(outcome.reused for outcome in again)
-    for table in (bench_table, stage_table):
+    for table in (bench_table, stage_table, group_table):
         assert table(first).csv() == table(again).csv()
         assert table(first).text() == table(again).text()
 
@@ -141,7 +143,7 @@ def test_a_run_is_used_again_only_if_nothing_that_decides_it_changed(clips, fake
         options["limit"] = 2
     elif change == "recording":
         (Path(clips[0]) / "note.txt").write_text("touched")
-        campaign._input_hash.cache_clear()
+        campaign._sha256.cache_clear()
     else:
         monkeypatch.setattr(campaign, "code_hash", lambda: "other code")
     run_campaign(make(clips[:1], registry, **options), tmp_path / "bench")
@@ -154,6 +156,24 @@ def test_each_row_leads_to_its_run_folder(clips, fake_runs, tmp_path):
     for row in bench_table(outcomes).rows:
         run = json.loads((tmp_path / "bench" / row["run"] / RUN_FILE).read_text())
         assert {"source_sha256", "config_sha256", "code_sha256"} <= set(run)
+
+
+def test_groups_pool_frames_and_count_missing_outputs(clips, fake_runs, tmp_path):
+    _, _, registry = fake_runs
+    outcomes = run_campaign(make(clips, registry, modes=["hat"]), tmp_path / "bench")
+    (row,) = group_table(outcomes).rows
+    assert (row["clips"], row["targets"]) == (2, 6)
+    assert row["coverage"] == pytest.approx(4 / 6)
+    assert row["E_q_deg_mean"] == pytest.approx(3.0)
+    assert row["E_p_sd"] == pytest.approx(0.0577, abs=1e-4)
+    assert row["fps"] == pytest.approx(6 / (3 / 21 + 3 / 22))
+
+
+def test_graph_runs_go_through_replay_and_compare_with_track(clips):
+    (job,) = bench_jobs(clips_named(clips[:1]), ["graph"], ["own"], [0], "default")
+    assert "replay" in job.command(Path("out"))
+    assert "--mode" not in job.command(Path("out"))
+    assert job.fingerprint()["mode"] == "hat"
 
 
 def test_scheduler_without_distributed_says_what_to_install(clips, tmp_path, monkeypatch):

@@ -1,0 +1,143 @@
+"""What a run is made from: a bag, a clip of the ``sequence`` layout, or one sequence of a data set as published."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hat_ros import lie
+from hat_ros.bag import BagReader, deserialize
+from hat_ros.datasets.image_files import ImageRecording
+from hat_ros.datasets.importer import open_dataset
+from hat_ros.datasets.sequence import load_sequence
+from hat_ros.errors import BagError, DatasetError, FrameError, UsageError
+from hat_ros.nodes.images import decode_image, decode_mask
+from hat_ros.provenance import input_hash
+from hat_ros.target import Target, load_target
+from hat_ros.types import Frame
+
+
+@dataclass(frozen=True)
+class SourceSpec:
+    """Where a recording is.
+
+    Attributes:
+        path: bag, sequence folder, or root folder of a data set.
+        dataset: layout of the data set (``spark``, ``shirt``, ...); empty = ``path`` is one recording.
+        sequence: name of the sequence within the data set.
+        model: CAD model, for data sets that bring none.
+    """
+
+    path: Path
+    dataset: str = ""
+    sequence: str = ""
+    model: Path | None = None
+
+    @property
+    def name(self) -> str:
+        """Name for tables and folders."""
+        return (self.sequence if self.dataset else self.path.resolve().name).replace("/", "_")
+
+    @property
+    def group(self) -> str:
+        """What it belongs to: the data set, or the folder that it lies in."""
+        return self.dataset or self.path.resolve().parent.name
+
+    def sha256(self) -> str:
+        """Digest of everything that the recording is made of."""
+        if not self.dataset:
+            return input_hash(self.path)
+        recording = self._in_dataset()
+        digest = hashlib.sha256(recording.camera.K.tobytes() + recording.distortion.tobytes())
+        for item in recording.files:
+            truth = b"" if item.T_cam_target is None else item.T_cam_target.tobytes()
+            box = b"" if item.box_xyxy is None else np.asarray(item.box_xyxy, dtype=np.float64).tobytes()
+            digest.update(b"\0".join((str(item.stamp_ns).encode(), truth, box)))
+            for path in (item.image, *item.masks):
+                digest.update(input_hash(path).encode())
+        digest.update(input_hash(recording.target_path).encode())
+        return digest.hexdigest()
+
+    def open(self) -> Source:
+        """Open the recording and its CAD model.
+
+        Raises:
+            UsageError: there is nothing of that name, or it is no recording.
+            InputError: it is malformed, or no CAD model lies beside it.
+        """
+        if self.dataset:
+            return _source_of_images(self.path, self._in_dataset())
+        return open_source(self.path)
+
+    def _in_dataset(self) -> ImageRecording:
+        for recording in open_dataset(self.dataset, self.path, self.model, (self.sequence,)):
+            return recording
+        raise DatasetError(f"{self.path}: no sequence named {self.sequence}")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A recording that was opened, with its target."""
+
+    path: Path
+    recording: ImageRecording | BagReader
+    target: Target
+
+    def frames(self, start: int = 0, limit: int | None = None) -> Iterator[Frame | FrameError]:
+        """Frames from number ``start`` on, at most ``limit`` of them; a malformed one comes as its error."""
+        stop = None if limit is None else start + limit
+        attempts = _attempts(self.recording) if isinstance(self.recording, BagReader) else self.recording.frames(stop)
+        return islice(attempts, start, stop)
+
+    def count(self, start: int = 0, limit: int | None = None) -> int:
+        """How many frames :meth:`frames` brings."""
+        rest = max(0, len(self.recording) - start)
+        return rest if limit is None else min(rest, limit)
+
+    @property
+    def frame_id(self) -> str:
+        """``header.frame_id`` of the images."""
+        return self.recording.frame_id if isinstance(self.recording, BagReader) else "camera"
+
+    def truth_rows(self) -> dict[int, NDArray[np.float64]]:
+        """Stamp -> true pose row (7,), empty when unknown."""
+        if isinstance(self.recording, BagReader):
+            return self.recording.truth_rows()
+        return {stamp: lie.row_from_matrix(T) for stamp, T in self.recording.truth().items()}
+
+
+def _attempts(bag: BagReader) -> Iterator[Frame | FrameError]:
+    """The frames of a bag; one that cannot be decoded does not end the stream."""
+    for packet in bag.packets():
+        kind = f"sensor_msgs/msg/{'CompressedImage' if packet.compressed else 'Image'}"
+        try:
+            rgb = decode_image(deserialize(packet.image, kind, bag.path))
+            mask = packet.mask and decode_mask(deserialize(packet.mask, "sensor_msgs/msg/Image", bag.path))
+            yield Frame(packet.stamp_ns, rgb, bag.camera, mask)
+        except FrameError as error:
+            yield error
+
+
+def open_source(path: str | Path) -> Source:
+    """Open a bag or a folder of the ``sequence`` layout, and the CAD model beside it; see :meth:`SourceSpec.open`."""
+    path = Path(path)
+    if not path.exists():
+        raise UsageError(f"recording {path}: no such file or folder")
+    if (path / "labels.json").is_file():
+        return _source_of_images(path, load_sequence(path))
+    if path.suffix != ".mcap" and not (path / "metadata.yaml").is_file():
+        raise UsageError(f"recording {path}: neither a bag (metadata.yaml) nor a sequence folder (labels.json)")
+    bag = BagReader(path)
+    if bag.target_path is None:
+        raise BagError(f"{path} has no target.yaml: put the CAD model and a target.yaml that names it into the folder")
+    return Source(path, bag, load_target(bag.target_path))
+
+
+def _source_of_images(path: Path, recording: ImageRecording) -> Source:
+    return Source(path, recording, load_target(recording.target_path, recording.unit_scale))
