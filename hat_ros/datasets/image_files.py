@@ -41,7 +41,7 @@ class ImageFile:
 
 @dataclass(frozen=True, eq=False)
 class ImageRecording:
-    """Image files with one calibration; implements :class:`hat_ros.datasets.Recording`.
+    """Image files with one calibration.
 
     Attributes:
         name: for tables.
