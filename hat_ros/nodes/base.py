@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
-from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -33,6 +33,9 @@ OK, WARN, ERROR = 0, 1, 2
 # Ends the sentence of a stage timeout, so that whoever started the node can tell it from other failures.
 HANGS = "a stage does not answer"
 _ACK_TIMEOUT_S = 10.0
+# Each event is an entity more in every wait; between our own nodes readiness already says what does not fit.
+_NO_EVENTS = SubscriptionEventCallbacks(use_default_callbacks=False)
+_NO_PUBLISHER_EVENTS = PublisherEventCallbacks(use_default_callbacks=False)
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 
 
@@ -64,7 +67,7 @@ class HatNode(LifecycleNode):
         self.failure: HatError | None = None
         self._outputs: dict[str, tuple[Any, tuple[str, ...]]] = {}
         self._inputs: dict[str, Any] = {}
-        self._writers: dict[str, int] = {}
+        self._required: set[str] = set()
         self._announced = False
         self._level, self._text = OK, "unconfigured"
         self._ready = self.create_publisher(message_class(topics.TYPES[topics.READY]), topics.READY, qos.LATCH)
@@ -72,7 +75,7 @@ class HatNode(LifecycleNode):
             message_class(topics.TYPES[topics.DIAGNOSTICS]), topics.DIAGNOSTICS, qos.OUT
         )
         self.create_timer(1.0, self._every_second, clock=STEADY)
-        self.create_timer(0.02, self._announce, clock=STEADY)
+        self._announcer = self.create_timer(0.02, self._announce, clock=STEADY)
 
     # ------------------------------------------------------------ for subclasses
 
@@ -98,7 +101,9 @@ class HatNode(LifecycleNode):
         if self.settings.recorded and topic in topics.RECORDED:
             readers = (*readers, "recorder")
         profile = qos.profile_of(topic, self.settings.live)
-        publisher = self.create_lifecycle_publisher(message_class(topics.TYPES[topic]), topic, profile)
+        publisher = self.create_lifecycle_publisher(
+            message_class(topics.TYPES[topic]), topic, profile, event_callbacks=_NO_PUBLISHER_EVENTS
+        )
         self._outputs[topic] = (publisher, readers)
         return publisher
 
@@ -113,12 +118,6 @@ class HatNode(LifecycleNode):
         with_info: bool = False,
     ) -> None:
         """Subscribe; the node is ready once a publisher is matched, unless the input is not required."""
-        self._writers[topic] = 0 if required else 1
-
-        def matched(event: Any) -> None:
-            if required:
-                self._writers[topic] = event.current_count
-
         # rclpy looks at the signature to decide whether a callback wants the message's info.
         plain, informed = (lambda message: guarded(message)), (lambda message, info: guarded(message, info))
         guarded = partial(self.guarded, callback)
@@ -127,9 +126,11 @@ class HatNode(LifecycleNode):
             topic,
             informed if with_info else plain,
             profile or qos.profile_of(topic, self.settings.live),
-            event_callbacks=SubscriptionEventCallbacks(matched=matched),
+            event_callbacks=_NO_EVENTS if required else None,
             raw=raw,
         )
+        if required:
+            self._required.add(topic)
 
     def has_input(self, topic: str) -> bool:
         """Whether the topic is subscribed."""
@@ -138,7 +139,7 @@ class HatNode(LifecycleNode):
     def drop_input(self, topic: str) -> None:
         """Unsubscribe."""
         self.destroy_subscription(self._inputs.pop(topic))
-        del self._writers[topic]
+        self._required.discard(topic)
 
     def guarded(self, callback: Callable[..., None], *args: Any) -> None:
         """Run a callback while active; an exception becomes a failure with one sentence."""
@@ -169,7 +170,7 @@ class HatNode(LifecycleNode):
 
     def unmatched(self) -> list[str]:
         """Endpoints that do not know their counterparts yet; with none, nothing sent from now on is lost."""
-        silent = [f"a publisher of {topic}" for topic, writers in self._writers.items() if not writers]
+        silent = [f"a publisher of {t}" for t in sorted(self._required) if not self._inputs[t].get_publisher_count()]
         return silent + [reader for topic in self._outputs for reader in self._missing_readers(topic)]
 
     def _missing_readers(self, topic: str) -> list[str]:
@@ -193,6 +194,7 @@ class HatNode(LifecycleNode):
         unmatched = self.unmatched()
         if not unmatched:
             self._announced = True
+            self._announcer.cancel()
             self._ready.publish(self.wire.header(time.time_ns(), self.NAME))
         self.report(OK, "ready" if not unmatched else f"waiting for {', '.join(unmatched)}")
 
@@ -238,6 +240,7 @@ class HatNode(LifecycleNode):
     def on_activate(self, state: Any) -> TransitionCallbackReturn:
         """Accept messages from now on."""
         self.active = True
+        self._announcer.reset()
         self.report(OK, "waiting for the other nodes")
         return super().on_activate(state)
 
@@ -264,7 +267,7 @@ class HatNode(LifecycleNode):
             self.destroy_lifecycle_publisher(publisher)
         self._inputs.clear()
         self._outputs.clear()
-        self._writers.clear()
+        self._required.clear()
         self.cleanup()
         self.report(OK, "unconfigured")
 

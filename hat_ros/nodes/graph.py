@@ -170,6 +170,7 @@ class _Run:
         self._executor = SingleThreadedExecutor(context=self._context)
         self._nodes: list[base.HatNode] = []
         self._peak_memory_mib: dict[str, float] = {}
+        self._next_look_s = 0.0
 
     def start_nodes(self, graph: str, delays_ms: Mapping[str, float]) -> None:
         """Start the stage processes, then player and recorder here."""
@@ -232,8 +233,8 @@ class _Run:
 
     def _check(self) -> None:
         """Whatever went wrong, as one sentence."""
+        self._note_memory()
         for name, process in self._processes.items():
-            self._note_memory(name, process)
             code = process.poll()
             if code is not None and not (code == 0 and self._player.finished):
                 raise self._death(name, code)
@@ -243,11 +244,16 @@ class _Run:
             if node.failure is not None:
                 raise node.failure
 
-    def _note_memory(self, name: str, process: subprocess.Popen[bytes]) -> None:
-        with contextlib.suppress(OSError, ValueError, StopIteration):
-            status = Path(f"/proc/{process.pid}/status").read_text(encoding="ascii")
-            line = next(line for line in status.splitlines() if line.startswith("VmHWM:"))
-            self._peak_memory_mib[name] = int(line.split()[1]) / 1024
+    def _note_memory(self) -> None:
+        """Peak memory of the node processes, looked at twice a second."""
+        if time.monotonic() < self._next_look_s:
+            return
+        self._next_look_s = time.monotonic() + 0.5
+        for name, process in self._processes.items():
+            with contextlib.suppress(OSError, ValueError, StopIteration):
+                status = Path(f"/proc/{process.pid}/status").read_text(encoding="ascii")
+                line = next(line for line in status.splitlines() if line.startswith("VmHWM:"))
+                self._peak_memory_mib[name] = int(line.split()[1]) / 1024
 
     def _death(self, name: str, code: int) -> HatError:
         lines = (self._folder / f"{name}.log").read_text(encoding="utf-8", errors="replace").split("\n")

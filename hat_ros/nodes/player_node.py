@@ -74,7 +74,8 @@ class PlayerNode(base.HatNode):
         self.input(topics.STATUS, self._on_status)
         self.input(topics.READY, self._on_ready, profile=qos.LATCH_READER, required=False)
         self.input(topics.DIAGNOSTICS, self._on_diagnostics, required=False)
-        self._timer = self.create_timer(0.002, partial(self.guarded, self._feed), clock=base.STEADY)
+        period_s = 0.002 if settings.live else 0.05  # a replay is driven by its statuses
+        self._timer = self.create_timer(period_s, partial(self.guarded, self._feed), clock=base.STEADY)
 
     def cleanup(self) -> None:
         """Stop playing."""
