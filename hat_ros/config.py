@@ -47,7 +47,7 @@ class ClassicalConfig:
     cold_side_px: int = option(112, "longer side of the reduced image of a search from nothing", low=48, high=512)
     check_interval_frames: int = option(20, "frames between independent checks of a tracked mask", low=1)
     min_prior_overlap: float = option(0.6, "overlap with the mask below which a prior is not used", low=0, high=1)
-    min_shape_overlap: float = option(0.7, "overlap with the nearest CAD silhouette that a found mask needs", low=0)
+    min_shape_overlap: float = option(0.75, "overlap with the nearest CAD silhouette that a found mask needs", low=0)
 
 
 @dataclass(frozen=True)
@@ -240,7 +240,7 @@ class RefinementConfig:
     same_pose_deg: float = option(5.0, "a start this close to a refined pose is not refined once more", low=0, high=180)
     switch_margin: float = option(0.05, "lead in image evidence that a second start within a basin needs", low=0)
     arbitration_margin: float = option(0.15, "summed lead in image evidence that decides between basins", low=0)
-    certain_quality: float = option(0.9, "image evidence that needs no second anchor to be TRACKING", low=0, high=1)
+    certain_share: float = option(0.9, "overlap and support that need no second anchor to be TRACKING", low=0, high=1)
 
 
 @dataclass(frozen=True)

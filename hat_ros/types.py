@@ -264,12 +264,15 @@ class Refined:
         covariance: (6, 6) of ``[translation (m); rotation vector (rad)]``, as in :class:`Estimate`.
         overlap: intersection over union of the rendered silhouette and the mask, NaN without a silhouette mask.
         support: share of the visible contour whose image evidence agrees with the pose, 0 to 1.
+        visible_overlap: the overlap where the image is bright enough to tell: silhouette without mask counts by its
+            brightness, because the shadowed side of a target is black on black. NaN without a silhouette mask.
     """
 
     pose_row: Float
     covariance: Float
     overlap: float
     support: float
+    visible_overlap: float = float("nan")
 
     @cached_property
     def T_cam_target(self) -> Float:

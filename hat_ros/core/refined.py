@@ -208,7 +208,7 @@ class RefinedFusion:
         if not self._is_supported(refined):
             return Fused(otherwise, predicted)
         T = refined.T_cam_target
-        certain = quality(refined) >= self._refinement.certain_quality or self._n_agreed > 0
+        certain = min(refined.overlap, refined.support) >= self._refinement.certain_share or self._n_agreed > 0
         return Fused(
             T,
             predicted,
@@ -219,10 +219,10 @@ class RefinedFusion:
 
 
 def quality(refined: Refined | None) -> float:
-    """Image evidence for a pose, 0 to 1: mean of silhouette overlap and contour support, 0 for a refused one.
+    """Image evidence for a pose, 0 to 1: mean of contour support and visible silhouette overlap, 0 for a refused one.
 
-    Without a silhouette mask the contour speaks alone.
+    What is black on black speaks neither for nor against a pose. Without a silhouette mask the contour speaks alone.
     """
     if refined is None:
         return 0.0
-    return refined.support if np.isnan(refined.overlap) else 0.5 * (refined.support + refined.overlap)
+    return refined.support if np.isnan(refined.visible_overlap) else 0.5 * (refined.support + refined.visible_overlap)

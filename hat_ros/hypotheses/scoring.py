@@ -12,13 +12,11 @@ import cv2
 import numpy as np
 
 from hat_ros.refinement.refiner import Fit
-from hat_ros.refinement.view import MaskField, TargetViewer, View
+from hat_ros.refinement.view import VISIBLE_LEVEL, MaskField, TargetViewer, View
 from hat_ros.types import Frame
 
 # Outlines closer than this agree, pixels.
 _TOLERANCE_PX = 0.5
-# Luma at which background is bright enough to tell that no target covers it; a shadowed part is black.
-_VISIBLE_LEVEL = 32.0
 # Mean distance of outlines at which a mismatch begins to saturate.
 _MISMATCH_PX = 0.3
 
@@ -66,7 +64,7 @@ class Scorer:
         covered = float(in_mask[silhouette].sum()) * unit
         beside = silhouette if inside is None else silhouette & inside
         uncovered = np.clip(distance[beside] - tolerance_px, 0.0, 1.0)
-        visible = np.minimum(view.resample(self._luma)[beside] * (1.0 / _VISIBLE_LEVEL), 1.0)
+        visible = np.minimum(view.resample(self._luma)[beside] * (1.0 / VISIBLE_LEVEL), 1.0)
         missing = float((uncovered * visible).sum()) * unit
         hidden = float(uncovered.sum()) * unit - missing
         outline = max(outline_px, 1.0)
@@ -90,7 +88,7 @@ class Scorer:
         near = length * fit.contour[:, 2]
         edge = (fit.contour[:, 4] > 0) & (np.abs(fit.contour[:, 3]) < 1.5)
         return Evidence(
-            self.field.compare(view).union_share,
+            self.field.compare(view, self._luma).union_share,
             excess,
             missing,
             hidden,

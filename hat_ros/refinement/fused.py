@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,8 +50,11 @@ class FusedPoseRefiner:
         if covariance is None:
             return None
         # The last round starts where the one before it converged: its view is the result's but for part of a pixel.
-        overlap = float("nan") if field is None else field.compare(fit.view).union_share
-        return Refined(lie.row_from_matrix(fit.T_cam_target), covariance, overlap, fit.support)
+        overlap = visible_overlap = float("nan")
+        if field is not None:
+            areas = field.compare(fit.view, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY))
+            overlap, visible_overlap = areas.union_share, areas.visible_share
+        return Refined(lie.row_from_matrix(fit.T_cam_target), covariance, overlap, fit.support, visible_overlap)
 
     def reset(self) -> None:
         """Nothing to forget: every frame stands for itself."""

@@ -21,6 +21,8 @@ from hat_ros.render.embree import RayCaster
 from hat_ros.target import Target
 from hat_ros.types import Camera
 
+# Luma at which background is bright enough to tell that no target covers it; a shadowed part is black.
+VISIBLE_LEVEL = 32.0
 # Margin of the rendered crop around the target, in crop pixels: the contour needs background on both sides.
 _CROP_MARGIN_PX = 4
 # Signed distance reported beyond the field of a mask.
@@ -201,8 +203,8 @@ class MaskField:
         centers = (np.arange(_DEPTH_BINS) + 0.5) * _DEPTH_BIN_PX
         return float(self._depth_counts @ np.clip(centers - depth_px, 0.0, 1.0))
 
-    def compare(self, view: View) -> Overlap:
-        """Areas of agreement and disagreement with a rendered silhouette."""
+    def compare(self, view: View, luma: NDArray[np.uint8]) -> Overlap:
+        """Areas of agreement and disagreement with a rendered silhouette; ``luma`` is the (H, W) image."""
         seen = self.resample(view)
         silhouette = view.mask
         inside = view.inside(self.mask.shape)
@@ -210,8 +212,9 @@ class MaskField:
             silhouette = silhouette & inside
         unit = 1.0 / view.scale**2
         common = float(np.count_nonzero(silhouette & (seen < 0))) * unit
-        missing = float(np.count_nonzero(silhouette)) * unit - common
-        return Overlap(common, max(self.area_px - common, 0.0), missing)
+        beside = view.resample(luma)[silhouette & (seen >= 0)]
+        visible = float(np.minimum(beside * (1.0 / VISIBLE_LEVEL), 1.0).sum()) * unit
+        return Overlap(common, max(self.area_px - common, 0.0), visible, len(beside) * unit - visible)
 
 
 @dataclass(frozen=True)
@@ -221,14 +224,21 @@ class Overlap:
     Attributes:
         common: mask and silhouette.
         extra: mask without silhouette.
-        missing: silhouette without mask.
+        missing: silhouette without mask, before something bright.
+        hidden: silhouette without mask, before black: it may be there, unlit.
     """
 
     common: float
     extra: float
     missing: float
+    hidden: float
 
     @property
     def union_share(self) -> float:
         """Intersection over union."""
+        return self.common / max(self.common + self.extra + self.missing + self.hidden, 1e-9)
+
+    @property
+    def visible_share(self) -> float:
+        """Intersection over union, of what could be seen."""
         return self.common / max(self.common + self.extra + self.missing, 1e-9)

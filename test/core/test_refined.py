@@ -29,7 +29,7 @@ class BasinRefiner:
             near = rotation_error_deg(basin, T_cam_target) < 15
             evidence = self._evidence(index).get(name)
             if near and evidence is not None and np.linalg.norm(basin[:3, 3] - T_cam_target[:3, 3]) < 1.0:
-                return Refined(lie.row_from_matrix(basin), COVARIANCE, *evidence)
+                return Refined(lie.row_from_matrix(basin), COVARIANCE, *evidence, visible_overlap=evidence[0])
         return None
 
     def reset(self):
@@ -202,10 +202,13 @@ def test_a_rival_must_outnumber_the_anchors_behind_the_track(scene):
         assert (errors[switched_at:] < 1e-5).all()
 
 
-def test_a_box_without_silhouette_is_judged_by_the_contour_alone():
-    refined = Refined(np.zeros(7), COVARIANCE, float("nan"), 0.7)
-    assert quality(refined) == 0.7
-    assert quality(Refined(np.zeros(7), COVARIANCE, 0.9, 0.7)) == pytest.approx(0.8)
+def test_evidence_is_what_can_be_seen():
+    def refined(**changes):
+        return Refined(np.zeros(7), COVARIANCE, **{"overlap": 0.4, "support": 0.7, "visible_overlap": 0.9, **changes})
+
+    assert quality(refined()) == pytest.approx(0.8)
+    assert quality(refined(overlap=0.1)) == quality(refined())
+    assert quality(refined(overlap=float("nan"), visible_overlap=float("nan"))) == 0.7
     assert quality(None) == 0.0
 
 
