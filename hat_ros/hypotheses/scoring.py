@@ -101,7 +101,7 @@ class Scorer:
 def shape_score(excess_px: float, missing_px: float, hidden_px: float) -> float:
     """The part of :func:`log_score` that compares silhouette and mask."""
     return float(
-        -4.5 * np.log1p(excess_px / _MISMATCH_PX)
+        -6.0 * np.log1p(excess_px / _MISMATCH_PX)
         - 1.7 * np.log1p(missing_px / _MISMATCH_PX)
         - 1.5 * np.log1p(hidden_px / _MISMATCH_PX)
     )
@@ -110,10 +110,11 @@ def shape_score(excess_px: float, missing_px: float, hidden_px: float) -> float:
 def log_score(e: Evidence) -> float:
     """Log-likelihood of a pose up to a constant common to all candidates of an image.
 
-    The weights maximise the likelihood of the right basin among the candidates of images of eleven spacecraft, with
-    masks that are right, found by thresholds, two pixels too large, or lack a part; each spacecraft was judged with
-    weights fitted to the others. Logarithms, because masks fail in patches: a large patch says little more than a
-    small one.
+    The weights are those of a multinomial logistic regression of the right basin on the evidence, over some eight
+    hundred images of ten spacecraft whose masks were right, found by thresholds, two pixels too large, or lacked parts;
+    on a spacecraft left out of the fit the right basin wins in 97 % of the images (by overlap alone: 84 %). So
+    ``selector.score_scale`` 1 takes them at their word. Logarithms, because masks fail in patches: a large patch says
+    little more than a small one.
     """
     shape = shape_score(e.excess_px, e.missing_px, e.hidden_px)
-    return shape - 2.6 * e.mask_rms_px + 2.8 * e.edge_share + 4.0 * e.mask_share
+    return shape - 5.0 * e.mask_rms_px + 3.3 * e.edge_share + 4.6 * e.mask_share
