@@ -43,7 +43,7 @@ _RUNS = (
 Variant = Callable[[RunLog], RunLog]
 
 _ERRORS = (
-    Column("E_t_m_mean", "E_t m", ".3f", r"$E_t$ (m)"),
+    Column("E_t_m_mean", "E_t m", ".4f", r"$E_t$ (m)"),
     Column("E_q_deg_mean", "E_q deg", ".2f", r"$E_q$ ($^\circ$)"),
     Column("E_p_mean", "E_p", ".4f", "$E_p$"),
     Column("E_p_sd", "SD", ".3f"),

@@ -27,8 +27,8 @@ _WHERE = (
 _FIGURES = (
     Column("E_p_mean", "E_p", ".4f", "$E_p$"),
     Column("E_p_sd", "SD", ".3f"),
-    Column("E_t_m_mean", "E_t m", ".3f", r"$E_t$ (m)"),
-    Column("E_t_m_sd", "SD", ".3f"),
+    Column("E_t_m_mean", "E_t m", ".4f", r"$E_t$ (m)"),
+    Column("E_t_m_sd", "SD", ".4f"),
     Column("E_q_deg_mean", "E_q deg", ".2f", r"$E_q$ ($^\circ$)"),
     Column("E_q_deg_sd", "SD", ".2f"),
     Column("E_q_over_90_share", ">90", ".1%"),

@@ -29,6 +29,7 @@ _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NU
 
 
 GRAPH = "graph"
+CONNECT_TIMEOUT_S = 10
 
 
 @dataclass(frozen=True)
@@ -191,7 +192,7 @@ def _on_cluster(address: str) -> Callable[[Work], Iterator[Outcome]]:
 
     def execute(work: Work) -> Iterator[Outcome]:
         try:
-            client = Client(address, timeout="20s")
+            client = Client(address, timeout=CONNECT_TIMEOUT_S)
         except OSError as error:
             raise RunError(f"no Dask scheduler answers at {address} ({error})") from None
         with client:

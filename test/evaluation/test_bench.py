@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from scripted import CAMERA, frame, stamp, true_row
@@ -9,7 +10,7 @@ from scripted import CAMERA, frame, stamp, true_row
 from hat_ros import lie
 from hat_ros.bag import BagWriter
 from hat_ros.datasets.models import write_model
-from hat_ros.errors import MissingDependencyError, UsageError
+from hat_ros.errors import MissingDependencyError, RunError, UsageError
 from hat_ros.evaluation import campaign
 from hat_ros.evaluation.bench import bench_jobs, bench_table, clips_named, failures, group_table, stage_table
 from hat_ros.evaluation.campaign import Job, run_campaign
@@ -55,7 +56,7 @@ def fake_runs(monkeypatch):
         return Done(0, "")
 
     jobs_by_name: dict[str, Job] = {}
-    monkeypatch.setattr(campaign.subprocess, "run", run)
+    monkeypatch.setattr(campaign, "subprocess", SimpleNamespace(run=run))
     return log, broken, jobs_by_name
 
 
@@ -191,3 +192,43 @@ def test_bad_configuration_is_found_before_anything_runs(clips, fake_runs, tmp_p
     with pytest.raises(ConfigError, match="gap_frames"):
         run_campaign(jobs, tmp_path / "bench")
     assert log == []
+
+
+@pytest.fixture
+def cluster(request):
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=request.param, dashboard_address=None, silence_logs=50
+    ) as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.mark.parametrize("cluster", [False], indirect=True)
+def test_cluster_of_two_workers_runs_and_resumes_a_campaign(clips, fake_runs, tmp_path, cluster):
+    log, broken, registry = fake_runs
+    jobs = make(clips, registry)
+    broken.add(jobs[2].name)
+    outcomes = run_campaign(jobs, tmp_path / "bench", scheduler=cluster)
+    assert failures(outcomes) == [f"{jobs[2].name}: hat: the bag is damaged"]
+    broken.clear()
+    first = run_campaign(jobs, tmp_path / "bench", scheduler=cluster)
+    again = run_campaign(jobs, tmp_path / "bench")
+    assert len(log) == len(jobs) + 1
+    assert bench_table(again).csv() == bench_table(first).csv()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cluster", [True], indirect=True)
+def test_real_runs_in_worker_processes(clips, tmp_path, cluster):
+    options = {"limit": 1, "overrides": ["segmentation.backend=classical"]}
+    jobs = make(clips, {}, modes=["independent"], **options)
+    outcomes = run_campaign(jobs, tmp_path / "bench", scheduler=cluster)
+    assert failures(outcomes) == []
+    assert [outcome.figures["frames"] for outcome in outcomes] == [1, 1]
+
+
+def test_scheduler_that_does_not_answer(clips, tmp_path, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(campaign, "CONNECT_TIMEOUT_S", 1)
+    with pytest.raises(RunError, match="no Dask scheduler answers"):
+        run_campaign(make(clips, {}), tmp_path / "bench", scheduler="tcp://127.0.0.1:9")
