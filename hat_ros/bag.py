@@ -7,8 +7,11 @@ flipped bit. Bags of others (any topic names, sqlite3 storage, no manifest) are 
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import io
 import json
+import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,7 +19,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
@@ -35,12 +38,15 @@ from hat_ros.types import Camera, Frame
 TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
 MANIFEST = "manifest.json"
 TARGET_FILE = "target.yaml"
+RESERVE = ".reserve"
 
 _IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 _MASK_TYPE = "sensor_msgs/msg/Image"
 _POSE_TYPE = "geometry_msgs/msg/PoseStamped"
 _MAX_METADATA_BYTES = 16 * 2**20
+# The last chunk (1 MiB and one message), the index and the metadata of a long run.
+_RESERVE_BYTES = 8 * 2**20
 
 
 @dataclass(frozen=True)
@@ -348,7 +354,7 @@ def check_manifest(folder: Path) -> None:
 class BagWriter:
     """Writes a rosbag2 folder (MCAP, zstd chunks); a context manager.
 
-    The folder is complete and readable after :meth:`close`, also when a run was stopped half-way.
+    The folder is complete and readable after :meth:`close`, also when a run was stopped half-way or the disk is full.
 
     Args:
         path: folder to create.
@@ -377,6 +383,8 @@ class BagWriter:
         self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         with _as_run_error(self.path):
             self._writer.open()
+            self._file = ReservedFile(self._writer.storage.bio, self.path / RESERVE)
+            self._writer.storage.bio = self._file
 
     def __enter__(self) -> BagWriter:
         return self
@@ -394,6 +402,8 @@ class BagWriter:
             if topic not in self._connections:
                 self._connections[topic] = self._writer.add_connection(topic, kind, typestore=TYPESTORE)
             self._writer.write(self._connections[topic], max(0, log_ns), data)
+        if self._file.is_full:
+            raise RunError(f"cannot write {self.path}: the disk is full; what was written so far is readable")
 
     def write_message(self, topic: str, message: Any, log_ns: int) -> None:
         """Append a message of ``rosbags``' own classes."""
@@ -452,8 +462,52 @@ class BagWriter:
         if writer is None:
             return
         with _as_run_error(self.path):
+            self._file.free_reserve()
             writer.close()
             write_manifest(self.path)
+
+
+class ReservedFile:
+    """A file with some disk space put by: when the disk fills up, the reserve makes room to finish in good order.
+
+    Args:
+        file: the file as the MCAP writer opened it, still empty.
+        reserve: file that holds the reserve.
+    """
+
+    def __init__(self, file: BinaryIO, reserve: Path) -> None:
+        file.flush()
+        # Unbuffered, so that after an error it is known which bytes are in the file.
+        self.raw: io.RawIOBase = file.detach()
+        self._reserve = reserve
+        self.is_full = False
+        with reserve.open("wb") as out:
+            os.posix_fallocate(out.fileno(), 0, _RESERVE_BYTES)
+
+    def write(self, data: bytes | memoryview) -> int:
+        """Write all of it, if need be into the reserve; :attr:`is_full` tells."""
+        view = memoryview(data).cast("B")
+        while view:
+            try:
+                view = view[self.raw.write(view) :]
+            except OSError as error:
+                if error.errno not in (errno.ENOSPC, errno.EDQUOT) or self.is_full:
+                    raise
+                self.is_full = True
+                self.free_reserve()
+        return memoryview(data).nbytes
+
+    def tell(self) -> int:
+        """Position in the file."""
+        return self.raw.tell()
+
+    def free_reserve(self) -> None:
+        """Give the reserved space back."""
+        self._reserve.unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Close the file."""
+        self.raw.close()
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 import struct
@@ -12,7 +13,7 @@ import zstandard
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from hat_ros import lie
-from hat_ros.bag import MANIFEST, TYPESTORE, BagReader, BagWriter
+from hat_ros.bag import MANIFEST, RESERVE, TYPESTORE, BagReader, BagWriter
 from hat_ros.bag_check import check_mcap
 from hat_ros.errors import BagError, FrameError, HatError, RunError
 from hat_ros.nodes import topics
@@ -113,6 +114,42 @@ def test_a_stopped_writer_leaves_a_readable_bag(tmp_path):
         writer.write_frame(stamp(0), image(0), CAMERA)
         raise KeyboardInterrupt
     assert len(list(BagReader(tmp_path / "bag").frames())) == 1
+
+
+class FullDisk:
+    """Takes so many bytes, and more only once the reserve has been given up."""
+
+    def __init__(self, raw, room, reserve):
+        self.raw, self.room, self.reserve = raw, room, reserve
+
+    def write(self, data):
+        if self.reserve is not None and not self.reserve.exists():
+            self.room, self.reserve = self.room + 2**23, None
+        count = min(len(data), self.room)
+        if not count:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        self.room -= count
+        return self.raw.write(data[:count])
+
+    def __getattr__(self, name):
+        return getattr(self.raw, name)
+
+
+def test_a_full_disk_leaves_what_was_written_readable(tmp_path):
+    writer = BagWriter(tmp_path / "bag")
+    assert (tmp_path / "bag" / RESERVE).stat().st_blocks > 0
+    writer._file.raw = FullDisk(writer._file.raw, 2_500_000, tmp_path / "bag" / RESERVE)
+    written = 0
+    with pytest.raises(RunError, match="disk is full"):
+        while True:
+            pixels = np.random.default_rng(written).integers(0, 256, (480, 640, 3), dtype=np.uint8)
+            writer.write_frame(stamp(written), pixels, Camera(CAMERA.K, 640, 480))
+            written += 1
+    writer.close()
+    assert not (tmp_path / "bag" / RESERVE).exists()
+    frames = list(BagReader(tmp_path / "bag").frames())
+    assert written >= 2
+    assert len(frames) in (written, written + 1), "the frame that filled the disk is in the bag too"
 
 
 def test_a_closed_writer_says_so(tmp_path):

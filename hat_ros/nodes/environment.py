@@ -9,13 +9,28 @@ from pathlib import Path
 PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 
+# Eight processes with the segment of fastdds.xml; containers often have 64 MiB in all.
+_AMPLE_SHARED_BYTES = 8 * 64 * 2**20
 
-def profile_path() -> Path | None:
-    """The Fast DDS profile shipped with the package: in a checkout, in a prefix, or in a colcon install space."""
+
+def profile_path(shared_memory: Path = Path("/dev/shm")) -> Path | None:
+    """The Fast DDS profile shipped with the package, chosen by how much shared memory is free.
+
+    It lies in a checkout, in a prefix, or in a colcon install space; None when it is nowhere.
+    """
+    name = "fastdds.xml" if _free_bytes(shared_memory) >= _AMPLE_SHARED_BYTES else "fastdds_small.xml"
     here = Path(__file__).resolve()
     folders = [here.parents[2] / "config", Path(sys.prefix) / "share" / "hat_ros" / "config"]
     folders += [parent / "share" / "hat_ros" / "config" for parent in here.parents[4:]]
-    return next((folder / "fastdds.xml" for folder in folders if (folder / "fastdds.xml").is_file()), None)
+    return next((folder / name for folder in folders if (folder / name).is_file()), None)
+
+
+def _free_bytes(folder: Path) -> int:
+    try:
+        space = os.statvfs(folder)
+    except OSError:
+        return 0
+    return space.f_bavail * space.f_frsize
 
 
 def prepare_environment() -> None:

@@ -283,12 +283,16 @@ class _Run:
                 raise RunError(f"the nodes did not end within {_EXIT_TIMEOUT_S:g} s after the end of the stream")
         while self._recorder.counts[topics.STATUS] < self._player.n_status and time.monotonic() < limit:
             self._executor.spin_once(timeout_sec=0.05)
+        self._drain()
+        self._check()
+
+    def _drain(self) -> None:
+        """Record what has arrived and lies in the readers' queues."""
         idle = 0
-        while idle < 3:  # what was acknowledged lies in the reader's queues: empty them
+        while idle < 3:
             before = sum(self._recorder.counts.values())
             self._executor.spin_once(timeout_sec=0.02)
             idle = 0 if sum(self._recorder.counts.values()) > before else idle + 1
-        self._check()
 
     def close(self) -> None:
         """End every process that is left, put the truth into the record, close the bag."""
@@ -304,7 +308,9 @@ class _Run:
         for log in self._logs:
             log.close()
         try:
-            if self._nodes:
+            if len(self._nodes) == 2:
+                self._player.active = False
+                self._drain()
                 self._record_truth()
         finally:
             base.close(self._executor, self._nodes)

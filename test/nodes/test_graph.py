@@ -163,6 +163,21 @@ def test_a_node_that_dies_ends_the_replay_and_leaves_a_readable_result(clean_bag
     assert len(read_result_bag(tmp_path / "out")) >= 4
 
 
+def test_interrupting_leaves_a_readable_result_and_no_process(clean_bag, config, tmp_path):
+    pids = []
+
+    def interrupt(progress):
+        if progress.done == 3:
+            pids.append(node_pid("fusion"))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        play(clean_bag, config, tmp_path / "out", on_progress=interrupt)
+    assert len(read_result_bag(tmp_path / "out")) >= 3
+    with pytest.raises(ProcessLookupError):
+        os.kill(pids[0], 0)
+
+
 def test_a_stage_that_hangs_is_named(clean_bag, config, tmp_path):
     def stop(progress):
         if progress.done == 3:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
+import numpy as np
 import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -12,11 +13,12 @@ from rclpy.lifecycle import TransitionCallbackReturn
 
 import hat_ros
 from hat_ros.errors import ConfigError
-from hat_ros.nodes import base, topics, wire
+from hat_ros.nodes import base, images, topics, wire
+from hat_ros.nodes.overlay_node import OverlayNode
 from hat_ros.nodes.recorder_node import RecorderNode
 from hat_ros.nodes.selector_node import SelectorNode
 from hat_ros.nodes.slam_node import SlamNode
-from hat_ros.types import Candidates, Motion
+from hat_ros.types import Camera, Candidates, Estimate, Motion, TrackState
 
 PACKAGE = Path(hat_ros.__file__).parent
 
@@ -136,6 +138,39 @@ def test_recorder_needs_a_place_to_write(executor):
     node = add(executor, RecorderNode)
     node.start()
     assert "parameter 'out' is empty" in str(node.failure)
+
+
+def test_overlay_is_drawn_for_whoever_looks_and_images_come_only_then(executor, model):
+    node = add(executor, OverlayNode, target=str(model))
+    node.start()
+    assert not node.has_input(topics.FRAME)
+    viewer = rclpy.create_node("viewer", context=executor.context)
+    executor.add_node(viewer)
+    seen = []
+
+    def publisher(topic):
+        return viewer.create_publisher(wire.message_class(topics.TYPES[topic]), topic, base.qos.profile_of(topic))
+
+    send = {topic: publisher(topic) for topic in (topics.HAT_CAMERA_INFO, topics.FRAME, topics.STATUS)}
+    subscription = viewer.create_subscription(
+        wire.message_class(topics.TYPES[topics.OVERLAY]), topics.OVERLAY, seen.append, base.qos.DEBUG
+    )
+    assert spin_until(executor, lambda: node.has_input(topics.FRAME), turns=400)
+    assert spin_until(executor, lambda: all(p.get_subscription_count() for p in send.values()))
+    make, camera = wire.Wire.ros(), Camera(np.array([[100.0, 0, 31.5], [0, 100, 23.5], [0, 0, 1]]), 64, 48)
+    estimate = Estimate(7, TrackState.TRACKING, np.array([0, 0, 9.0, 0, 0, 0, 1]), np.eye(6))
+    send[topics.HAT_CAMERA_INFO].publish(make.camera_info(7, "c", camera))
+    send[topics.FRAME].publish(make.frame(7, "c", np.zeros((48, 64, 3), np.uint8), None))
+    spin_until(executor, lambda: False, turns=20)
+    send[topics.STATUS].publish(make.status("c", estimate, wire.Admitted(0, 0, 0)))
+    assert spin_until(executor, lambda: seen)
+    drawn = images.decode_image(seen[0])
+    assert drawn.shape == (48, 64, 3)
+    assert drawn.max() > 100
+    assert seen[0].header.frame_id == "c"
+    viewer.destroy_subscription(subscription)
+    assert spin_until(executor, lambda: not node.has_input(topics.FRAME), turns=400)
+    viewer.destroy_node()
 
 
 # ------------------------------------------------------------------ what the sources promise

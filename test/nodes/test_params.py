@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import os
 
 import pytest
 import rclpy
@@ -88,13 +88,17 @@ def test_parameters_cannot_change_under_a_running_stage(make):
     assert not result.successful
 
 
+def test_profile_fits_the_shared_memory_there_is(monkeypatch, tmp_path):
+    assert profile_path(tmp_path / "none").name == "fastdds_small.xml"
+    space = os.statvfs_result((4096, 4096, 2**24, 2**24, 2**24, 0, 0, 0, 0, 255))
+    monkeypatch.setattr(os, "statvfs", lambda _: space)
+    assert "<segment_size>67108864<" in profile_path().read_text()
+
+
 def test_environment_defaults_leave_the_user_alone(monkeypatch):
     monkeypatch.delenv(PROFILE, raising=False)
     monkeypatch.setenv(RANGE, "SUBNET")
     prepare_environment()
-    import os
-
-    assert Path(os.environ[PROFILE]).read_text().count("67108864") == 1
     assert os.environ[PROFILE] == str(profile_path())
     assert os.environ[RANGE] == "SUBNET"
     monkeypatch.setenv(PROFILE, "/mine.xml")
