@@ -124,10 +124,15 @@ class RefinedFusion:
         anchor: Float,
         confidence: float,
     ) -> Fused:
-        """Anchor and track share a basin: the better refinement, else the paper's fusion of the two."""
-        track = self._best_refined(frame, detection, [anchor], track)
-        between = fuse_two(anchor, confidence, predicted, self._fusion, self._alignment_config.lever_m_per_rad)
-        return replace(self._outcome(track, between, predicted), gate_weight=1.0)
+        """Anchor and track share a basin: the better refinement; unsupported, the paper's fusion of the two.
+
+        An unsupported anchor with less evidence than the track does not pull at it.
+        """
+        best = self._best_refined(frame, detection, [anchor], track)
+        otherwise = predicted
+        if track is None or best is not track:
+            otherwise = fuse_two(anchor, confidence, predicted, self._fusion, self._alignment_config.lever_m_per_rad)
+        return replace(self._outcome(best, otherwise, predicted), gate_weight=1.0)
 
     def _arbitrate(
         self, frame: Frame, detection: Detection | None, track: Refined | None, predicted: Float, anchor: Float
@@ -208,6 +213,7 @@ class RefinedFusion:
         if not self._is_supported(refined):
             return Fused(otherwise, predicted)
         T = refined.T_cam_target
+        # An unknown overlap (NaN) is never certain.
         certain = min(refined.overlap, refined.support) >= self._refinement.certain_share or self._n_agreed > 0
         return Fused(
             T,
