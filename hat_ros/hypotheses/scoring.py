@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from hat_ros.refinement.refiner import Fit
-from hat_ros.refinement.view import VISIBLE_LEVEL, MaskField, TargetViewer, View
+from hat_ros.refinement.view import MaskField, TargetViewer, View
 from hat_ros.types import Frame
 
 # Outlines closer than this agree, pixels.
@@ -56,23 +56,9 @@ class Scorer:
 
     def mismatch(self, view: View, outline_px: float, tolerance_px: float) -> tuple[float, float, float]:
         """Excess, missing and hidden (see :class:`Evidence`) of what disagrees deeper than a tolerance."""
-        distance = self.field.resample(view)
-        silhouette = view.mask
-        inside = view.inside(self._luma.shape)
-        unit = 1.0 / view.scale**2
-        in_mask = np.clip(-distance - tolerance_px, 0.0, 1.0)
-        covered = float(in_mask[silhouette].sum()) * unit
-        beside = silhouette if inside is None else silhouette & inside
-        uncovered = np.clip(distance[beside] - tolerance_px, 0.0, 1.0)
-        visible = np.minimum(view.resample(self._luma)[beside] * (1.0 / VISIBLE_LEVEL), 1.0)
-        missing = float((uncovered * visible).sum()) * unit
-        hidden = float(uncovered.sum()) * unit - missing
+        areas = self.field.compare(view, self._luma, tolerance_px)
         outline = max(outline_px, 1.0)
-        return (
-            max(self.field.area_deeper_than(tolerance_px) - covered, 0.0) / outline,
-            missing / outline,
-            hidden / outline,
-        )
+        return areas.extra / outline, areas.missing / outline, areas.hidden / outline
 
     def evidence(self, fit: Fit) -> Evidence | None:
         """Gather the evidence for a refined pose; None when it cannot be seen."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
@@ -25,8 +26,9 @@ from hat_ros.types import Camera
 VISIBLE_LEVEL = 32.0
 # Margin of the rendered crop around the target, in crop pixels: the contour needs background on both sides.
 _CROP_MARGIN_PX = 4
-# Signed distance reported beyond the field of a mask.
-_FAR_OUTSIDE_PX = 1e3
+# The field reaches this far around the mask, pixels and share of the mask's longer side.
+_MIN_MARGIN_PX = 20
+_MARGIN_SHARE = 0.15
 # Histogram of how deep inside the mask its pixels lie.
 _DEPTH_BIN_PX = 0.05
 _DEPTH_BINS = 200
@@ -49,21 +51,6 @@ class View:
     camera: Camera
     origin_px: NDArray[np.float64]
     scale: float
-
-    def resample(self, image: NDArray[np.generic]) -> NDArray[np.generic]:
-        """An image seen through this crop; 0 beyond its border."""
-        affine = np.array([[1 / self.scale, 0, self.origin_px[0]], [0, 1 / self.scale, self.origin_px[1]]])
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        return cv2.warpAffine(image, affine, (self.camera.width, self.camera.height), flags=flags)
-
-    def inside(self, image_shape: tuple[int, int]) -> NDArray[np.bool_] | None:
-        """(h, w) which crop pixels lie in an image of this (height, width); None when all do."""
-        height, width = image_shape
-        x = np.arange(self.camera.width) / self.scale + self.origin_px[0]
-        y = np.arange(self.camera.height) / self.scale + self.origin_px[1]
-        if x[0] >= -0.5 and y[0] >= -0.5 and x[-1] <= width - 0.5 and y[-1] <= height - 0.5:
-            return None
-        return ((y >= -0.5) & (y <= height - 0.5))[:, None] & ((x >= -0.5) & (x <= width - 0.5))[None]
 
 
 class TargetViewer:
@@ -166,7 +153,7 @@ class MaskField:
         self.area_px = float(np.count_nonzero(mask))
         rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         self.size_px = float(max(np.ptp(rows), np.ptp(cols)) + 1)
-        margin = int(max(24, 0.35 * self.size_px))
+        margin = int(max(_MIN_MARGIN_PX, _MARGIN_SHARE * self.size_px))
         # Beyond the image border nothing is known: the border pixels continue, so that a cut is no contour.
         height, width = mask.shape
         y0, y1 = max(rows[0] - margin, -margin), min(rows[-1] + 1 + margin, height + margin)
@@ -186,35 +173,84 @@ class MaskField:
             np.minimum(depth * (1 / _DEPTH_BIN_PX), _DEPTH_BINS - 1).astype(np.intp), minlength=_DEPTH_BINS
         )
 
-    def resample(self, view: View) -> NDArray[np.float32]:
-        """Signed distance in image pixels, seen through a view's crop; far outside beyond the field."""
-        affine = np.array(
-            [
-                [1 / view.scale, 0, view.origin_px[0] - self.origin_px[0]],
-                [0, 1 / view.scale, view.origin_px[1] - self.origin_px[1]],
-            ]
-        )
-        size = (view.camera.width, view.camera.height)
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        return cv2.warpAffine(self.distance, affine, size, flags=flags, borderValue=_FAR_OUTSIDE_PX)
+    def compare(self, view: View, luma: NDArray[np.uint8], tolerance_px: float | None = None) -> Overlap:
+        """Areas of agreement and disagreement with a rendered silhouette.
 
-    def area_deeper_than(self, depth_px: float) -> float:
-        """Mask pixels further than this from the outline; counted in part over one pixel of depth."""
+        Args:
+            view: the silhouette.
+            luma: (H, W) the image in grey.
+            tolerance_px: only what lies deeper than this on the wrong side of the mask's outline counts as
+                disagreement, in part over one pixel of depth; None counts every pixel.
+        """
+        depth, band = (0.0, 1e-3) if tolerance_px is None else (tolerance_px, 1.0)
+        total = self.area_px if tolerance_px is None else self._area_deeper_than(tolerance_px)
+        offset = view.origin_px - self.origin_px
+        common, missing, hidden = silhouette_areas(
+            view.mask, self.distance, offset, luma, view.origin_px, 1.0 / view.scale, depth, band
+        )
+        return Overlap(common, max(total - common, 0.0), missing, hidden)
+
+    def _area_deeper_than(self, depth_px: float) -> float:
         centers = (np.arange(_DEPTH_BINS) + 0.5) * _DEPTH_BIN_PX
         return float(self._depth_counts @ np.clip(centers - depth_px, 0.0, 1.0))
 
-    def compare(self, view: View, luma: NDArray[np.uint8]) -> Overlap:
-        """Areas of agreement and disagreement with a rendered silhouette; ``luma`` is the (H, W) image."""
-        seen = self.resample(view)
-        silhouette = view.mask
-        inside = view.inside(self.mask.shape)
-        if inside is not None:
-            silhouette = silhouette & inside
-        unit = 1.0 / view.scale**2
-        common = float(np.count_nonzero(silhouette & (seen < 0))) * unit
-        beside = view.resample(luma)[silhouette & (seen >= 0)]
-        visible = float(np.minimum(beside * (1.0 / VISIBLE_LEVEL), 1.0).sum()) * unit
-        return Overlap(common, max(self.area_px - common, 0.0), visible, len(beside) * unit - visible)
+
+@njit(cache=True)
+def silhouette_areas(
+    silhouette: NDArray[np.bool_],
+    distance: NDArray[np.float32],
+    offset: NDArray[np.float64],
+    luma: NDArray[np.uint8],
+    origin: NDArray[np.float64],
+    step: float,
+    depth: float,
+    band: float,
+) -> tuple[float, float, float]:
+    """Image pixels of a silhouette that lie inside a mask, outside it before something bright, and before black.
+
+    Args:
+        silhouette: (h, w) crop.
+        distance: signed distance to the mask's outline, positive outside, on the mask's own crop.
+        offset: (2,) position of the silhouette's pixel (0, 0) on that crop.
+        luma: (H, W) image.
+        origin: (2,) position of the silhouette's pixel (0, 0) in the image.
+        step: image pixels per crop pixel.
+        depth: distance from the outline from which a pixel counts, fully from ``depth + band`` on.
+        band: see there.
+    """
+    h, w = distance.shape
+    height, width = luma.shape
+    common, missing, hidden = 0.0, 0.0, 0.0
+    for y in range(silhouette.shape[0]):
+        v = origin[1] + y * step
+        if v < -0.5 or v > height - 0.5:
+            continue
+        b = offset[1] + y * step
+        for x in range(silhouette.shape[1]):
+            if not silhouette[y, x]:
+                continue
+            u = origin[0] + x * step
+            if u < -0.5 or u > width - 0.5:
+                continue
+            a = offset[0] + x * step
+            if a < 0.0 or b < 0.0 or a >= w - 1 or b >= h - 1:
+                d = 1e3  # beyond the field, so far from the mask
+            else:
+                ia, ib = int(a), int(b)
+                fa, fb = a - ia, b - ib
+                d = (distance[ib, ia] * (1 - fa) + distance[ib, ia + 1] * fa) * (1 - fb) + (
+                    distance[ib + 1, ia] * (1 - fa) + distance[ib + 1, ia + 1] * fa
+                ) * fb
+            if d < 0.0:
+                common += min(max((-d - depth) / band, 0.0), 1.0)
+            else:
+                share = min(max((d - depth) / band, 0.0), 1.0)
+                level = luma[min(max(int(v + 0.5), 0), height - 1), min(max(int(u + 0.5), 0), width - 1)]
+                visible = min(level / VISIBLE_LEVEL, 1.0)
+                missing += share * visible
+                hidden += share * (1.0 - visible)
+    area = step * step
+    return common * area, missing * area, hidden * area
 
 
 @dataclass(frozen=True)
