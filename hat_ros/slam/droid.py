@@ -27,8 +27,8 @@ _MIN_SIDE = 8
 class DroidSlam:
     """Target-relative camera motion by DROID-SLAM.
 
-    No motion is given before the warm-up's keyframes are there, and none for frames without a detection, which do not
-    reach the tracker. A change of the camera and a result that is not finite start a new epoch.
+    No motion is given before the warm-up's keyframes are there, and, while the background is suppressed, none for
+    frames without a detection, which do not reach the tracker. A change of the camera and a result that is not finite start a new epoch.
 
     Args:
         config: the whole configuration; ``slam.droid`` is used.
@@ -41,7 +41,7 @@ class DroidSlam:
     """
 
     def __init__(self, config: HatConfig, target: Target | None, model: FlowModel | None = None) -> None:
-        self._config = config.slam.droid
+        self._config, self._masked = config.slam.droid, config.slam.masked
         self._device = choose_device(self._config.device)
         self._model = model or DroidNet.from_checkpoint(
             device=self._device, autocast=choose_precision(self._config.precision, self._device)
@@ -53,7 +53,7 @@ class DroidSlam:
     @torch.inference_mode()
     def update(self, frame: Frame, detection: Detection | None, prior: PosePrior | None) -> Motion:
         """Advance by one frame whose background is suppressed already; no prior is used."""
-        if detection is None or not detection.mask.any():
+        if self._masked and (detection is None or not detection.mask.any()):
             return Motion.none(self._epoch, self.n_keyframes)
         if self._camera is not None and not _same_camera(self._camera, frame.camera):
             self.reset()

@@ -16,6 +16,17 @@ from hat_ros.nets.droid import CORRELATION_LEVELS, DroidNet, upsample_disparity
 from hat_ros.nets.droid_geometry import pixel_grid
 
 DATA = Path(__file__).parents[1] / "data"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Small tensors gain nothing from a second thread, and two of them spin when the machine is busy."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 TOLERANCE = 2e-5
 
 

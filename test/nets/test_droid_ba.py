@@ -25,6 +25,15 @@ from hat_ros.nets.droid_ba import (
 DATA = Path(__file__).parents[1] / "data"
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Small tensors gain nothing from a second thread, and two of them spin when the machine is busy."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(scope="module")
 def data():
     recorded = np.load(DATA / "droid_ba.npz")
