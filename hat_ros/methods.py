@@ -4,6 +4,7 @@
 * ``tracking``: refine the previous pose on each image; the best appearance only to (re-)start. No decoder, no fusion.
 * ``offline``: HAT's observations, then a backtrace and one joint optimisation of all frames, and dense refinement where
   the configuration refines. Not causal: a reference.
+* ``srt3d``: the region tracker of :mod:`hat_ros.evaluation.srt3d`, started by the best appearance, never again.
 * ``observe``: the front ends alone, candidates at every frame and no output: what temporal sweeps run on.
 
 Each offers what :class:`~hat_ros.tracker.HatTracker` offers, so the pipeline runs them all alike.
@@ -22,6 +23,7 @@ from hat_ros.config import HatConfig
 from hat_ros.core.offline import solve_offline
 from hat_ros.core.refiner import Refiner
 from hat_ros.errors import UsageError
+from hat_ros.evaluation.srt3d import Srt3d
 from hat_ros.hypotheses.stage import HypothesisStage
 from hat_ros.refinement import create_refiner
 from hat_ros.segmentation.stage import SegmentationStage
@@ -30,7 +32,7 @@ from hat_ros.target import Target
 from hat_ros.tracker import HatTracker, Step
 from hat_ros.types import Camera, Candidates, Detection, Estimate, Frame, Motion, Refined, Selection, TrackState
 
-MODES = ("hat", "independent", "tracking", "offline", "observe")
+MODES = ("hat", "independent", "tracking", "offline", "srt3d", "observe")
 
 _NO_POSE = np.full(7, np.nan)
 _NO_COVARIANCE = np.full((6, 6), np.nan)
@@ -66,6 +68,7 @@ def create_method(mode: str, config: HatConfig, target: Target) -> Method:
         "independent": Independent,
         "tracking": Tracking,
         "offline": Offline,
+        "srt3d": Srt3d,
         "observe": Observe,
     }
     if mode not in methods:

@@ -17,7 +17,7 @@ from hat_ros.cli.options import (
     positive,
 )
 
-MODES = ("hat", "independent", "tracking", "offline", "observe")
+MODES = ("hat", "independent", "tracking", "offline", "srt3d", "observe")
 
 
 def add_commands(commands: Commands) -> None:
@@ -99,7 +99,8 @@ def _add_track(commands: Commands) -> None:
         choices=MODES,
         default="hat",
         help="hat: the paper's method; independent: best hypothesis of every frame; tracking: refine the last pose; "
-        "offline: all frames jointly, not causal; observe: front ends only, candidates at every frame, no poses "
+        "offline: all frames jointly, not causal; srt3d: region tracker started by the best hypothesis; "
+        "observe: front ends only, candidates at every frame, no poses "
         "(default: hat)",
     )
     _add_common(parser)
