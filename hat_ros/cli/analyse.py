@@ -116,13 +116,32 @@ def _numbers(text: str) -> list[int]:
     return list(dict.fromkeys(natural(item) for item in text.split(",")))
 
 
+_BENCH_COLUMNS = """\
+columns:
+  E_p, E_t, E_q, SD   pose, translation and rotation error: mean and sample standard deviation over scored frames
+  >90                 share of scored frames more than 90 degrees off
+  cover               share of frames with truth that got a pose
+  best<15, best<30    keyframes where the best of the K candidates is within 15 and 30 degrees
+  IoU, IoU>.9         overlap of detected and recorded mask: mean, share of frames at 0.9 or better
+  rel deg             median rotation error of the motion estimate from frame to frame
+  untrue              share of the frames more than 30 degrees off that call themselves TRACKING
+  in 95%              share of frames whose truth lies inside the stated 95 % ellipsoid
+  fps, p50, p99       frames per second with decoding, latency without; the first ten frames are left out
+  cpu ms              processor time per frame without decoding
+  MiB, +MiB           peak memory, and its growth from the first to the last quarter of the run
+  run                 result folder of the run, below --out
+"""
+
+
 def _add_bench(commands: Commands) -> None:
     parser = commands.add_parser(
         "bench",
         help="clips x methods x masks x starts in one table",
-        description="Run methods over clips, each run in a process of its own with one numerical thread, and write one "
-        "table as text, CSV, LaTeX, JSON and PNG. Runs that are done already, with the same inputs, "
+        description="Run methods over clips, each run in a process of its own with one numerical thread, and write\n"
+        "one table as text, CSV, LaTeX, JSON and PNG. Runs that are done already, with the same inputs,\n"
         "configuration and code, are used again.",
+        epilog=_BENCH_COLUMNS,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     _add_campaign(parser)
     parser.add_argument(
