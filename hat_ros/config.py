@@ -233,6 +233,7 @@ class RefinementConfig:
     enabled: bool = option(False, "refine the fused pose on the current image")
     render_px: int = option(160, "longer side of the views rendered for the contour", low=48, high=512)
     max_points: int = option(300, "contour points used", low=50, high=5000)
+    start_sigma_deg: float = option(5.0, "one sigma of the rotation that refinement starts from", low=0.01)
     max_rotation_deg: float = option(12.0, "a refinement that turns further left its basin: refused", low=0, high=180)
     max_shift: float = option(0.15, "and so is one that moves further, as a share of the range", low=0, high=1)
     min_overlap: float = option(0.6, "silhouette overlap with the mask that a supported pose needs", low=0, high=1)

@@ -18,6 +18,7 @@ from hat_ros.config import HatConfig
 from hat_ros.render import create_renderer
 from hat_ros.segmentation import region, sky
 from hat_ros.segmentation.boundary import refine_outline
+from hat_ros.segmentation.motion import MotionDetector, MotionEvidence
 from hat_ros.segmentation.shape import SilhouetteBank
 from hat_ros.target import Target
 from hat_ros.types import Detection, Frame, PosePrior
@@ -35,7 +36,14 @@ _MIN_CONTRAST_KEPT = 0.4  # share of its usual contrast at which a tracked outli
 _CONTRAST_GAIN = 0.2
 _AGREEMENT = 0.8  # overlap of two independent masks that mean the same target
 _SAME = 0.95  # overlap of two masks that are the same
-_CLEARLY_BETTER = 0.025  # shape overlap by which one explanation must beat the simpler one
+# A target contains most of what moves against the background, and hardly any texture that moves with it. Every
+# hundredth short of that costs a hundredth of shape overlap; ...
+_MIN_FOUND = 0.6
+_MAX_STILL = 0.25
+_MOTION_RELIEF = 0.1  # ... a mask that motion could have spoken against needs less, ...
+_CUT_SURCHARGE = 0.1  # ... one that the border cuts needs more, since part of a silhouette fits many things.
+_BENEFIT_OF_DOUBT = 0.1  # less plausibility keeps a mask than finds one
+_CLEARLY_BETTER = 0.025  # plausibility by which one explanation must beat the simpler one
 _SECOND_REGION_SHARE = 0.2  # a second bright region this large makes the choice between them a question
 _SCATTERED_GAIN = 0.1  # shape overlap that bridging the gaps between lit parts must bring
 _MAX_RETRY_FRAMES = 8
@@ -79,13 +87,13 @@ class _Found:
 
     Attributes:
         mask: (H, W) uint8 of 0 and 1.
-        shape_overlap: with the nearest CAD silhouette.
+        plausibility: see ``ClassicalSegmenter._plausibility``.
         contrast: colour step across the outline.
         models: colours of both sides.
     """
 
     mask: Mask
-    shape_overlap: float
+    plausibility: float
     contrast: float
     models: region.ColorModels
 
@@ -108,6 +116,7 @@ class ClassicalSegmenter:
         """Forget the previous masks."""
         self._mask: Mask | None = None  # of the previous frame
         self._before: Mask | None = None  # of the frame before that
+        self._motion = MotionDetector()
         self._models = region.ColorModels()
         self._contrast = 0.0  # of the tracked outline, slowly following
         self._since_check = 0
@@ -167,8 +176,8 @@ class ClassicalSegmenter:
                 shared = np.array([np.count_nonzero(r & known) for r in regions])
                 if shared.max() >= 0.5 * sizes[np.argmax(shared)]:
                     return int(np.argmax(shared))
-        shape = [self._bank.overlap(_shrink(r)) if s >= _SECOND_REGION_SHARE * sizes[0] else 0.0
-                 for r, s in zip(regions, sizes, strict=True)]  # fmt: skip
+        large = [r for r, size in zip(regions, sizes, strict=True) if size >= _SECOND_REGION_SHARE * sizes[0]]
+        shape = [self._bank.overlap(_shrink(r, self._config.cold_side_px).astype(bool)) for r in large]
         best = int(np.argmax(shape))
         if sky.touches_border(regions[best]) and shape[best] < self._config.min_shape_overlap:
             return None
@@ -177,6 +186,7 @@ class ClassicalSegmenter:
     # Anything else ---------------------------------------------------------------------------------------------
 
     def _before_texture(self, frame: Frame, prior: PosePrior | None) -> Mask | None:
+        self._motion.push(self._whole(frame).rgb)
         if self._mask is not None:
             tracked, aided = self._track(frame, prior)
             self._since_check += 1
@@ -253,7 +263,7 @@ class ClassicalSegmenter:
         return int(dx), int(dy)
 
     def _cross_check(self, frame: Frame, tracked: Mask, aided: bool) -> Mask | None:
-        """Compare a tracked mask with what a search from nothing finds; keep the one that the CAD explains better.
+        """Compare a tracked mask with what a search from nothing finds; keep the more plausible one.
 
         A mask held in place by a prediction is given up only for one that means something else.
         """
@@ -263,27 +273,48 @@ class ClassicalSegmenter:
         self._check_every = longer if agreement >= _SAME else _CHECK_UNAIDED_FRAMES
         if aided and agreement >= _AGREEMENT:
             return tracked
-        shape = self._bank.overlap(_shrink(tracked))
-        if found is not None and found.shape_overlap > shape + (_CLEARLY_BETTER if aided else 0.0):
+        small = _shrink(tracked, self._config.cold_side_px)
+        motion = self._motion.evidence()
+        plausibility = self._plausibility(small, motion)
+        if found is not None and found.plausibility > plausibility + (_CLEARLY_BETTER if aided else 0.0):
             return self._adopt(found)
-        return tracked if shape >= self._config.min_shape_overlap else None
+        kept = aided or plausibility >= self._required(small, motion) - _BENEFIT_OF_DOUBT
+        return tracked if kept else None
+
+    def _plausibility(self, mask: Mask, motion: MotionEvidence | None) -> float:
+        """How well a mask at the scale of a search is explained: its overlap with the nearest CAD silhouette, less
+        the doubt that motion raises: where something moves it is not, or what it holds moves with the background."""
+        doubt = 0.0
+        if motion is not None:
+            doubt += max(0.0, _MIN_FOUND - motion.found_share(mask))
+            doubt += max(0.0, motion.still_share(mask) - _MAX_STILL)
+        return self._bank.overlap(mask.astype(bool)) - doubt
+
+    def _required(self, mask: Mask, motion: MotionEvidence | None) -> float:
+        """Plausibility that a mask needs: less where motion has its say, more where the border hides a part."""
+        required = self._config.min_shape_overlap
+        if motion is not None:
+            required -= _MOTION_RELIEF
+        return required + _CUT_SURCHARGE if sky.touches_border(mask) else required
 
     def _search(self, frame: Frame, open_sides: tuple[str, ...]) -> _Found | None:
         """Find the target from nothing."""
-        whole = self._window(frame, (0, 0, frame.camera.width, frame.camera.height), 0.0, self._config.cold_side_px)
-        if whole is None:
-            return None
-        best, best_shape = None, self._config.min_shape_overlap
-        for sides in ((), *((side,) for side in open_sides)):
-            cut = region.cut_from_nothing(whole.rgb, sides)
+        whole = self._whole(frame)
+        motion = self._motion.evidence()
+        cuts = [region.cut_from_nothing(whole.rgb)]
+        if motion is not None:
+            cuts.append(region.cut_from_motion(whole.rgb, motion.moving))
+        cuts += [region.cut_from_nothing(whole.rgb, (side,)) for side in open_sides]
+        best, best_score = None, -np.inf
+        for cut in cuts:
             if cut is None:
                 continue
             contrast, chance = region.edge_contrast(whole.rgb, cut)
             if contrast < max(_MIN_CONTRAST, chance):
                 continue
-            shape = self._bank.overlap(cut.astype(bool))
-            if shape >= best_shape + (_CLEARLY_BETTER if best is not None else 0.0):
-                best, best_shape = cut, shape
+            score = self._plausibility(cut, motion)
+            if score >= max(self._required(cut, motion), best_score + _CLEARLY_BETTER):
+                best, best_score = cut, score
         if best is None:
             return None
         mask = whole.enlarge(best)
@@ -297,7 +328,14 @@ class ClassicalSegmenter:
         if cut is None:
             return None
         contrast, _ = region.edge_contrast(window.rgb, cut)
-        return _Found(self._finish(frame, window, cut), best_shape, contrast, models)
+        return _Found(self._finish(frame, window, cut), best_score, contrast, models)
+
+    def _whole(self, frame: Frame) -> _Window:
+        """The whole image, reduced for a search."""
+        h, w = frame.rgb.shape[:2]
+        scale = min(1.0, self._config.cold_side_px / max(h, w))
+        size = (max(1, round(w * scale)), max(1, round(h * scale)))
+        return _Window(0, 0, w, h, scale, cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA))
 
     def _finish(self, frame: Frame, window: _Window, cut: Mask) -> Mask:
         """Outline at full resolution, in a mask of the image's size."""
@@ -308,16 +346,14 @@ class ClassicalSegmenter:
         mask[window.y0 : window.y0 + window.height, window.x0 : window.x0 + window.width] = fine
         return mask
 
-    def _window(
-        self, frame: Frame, box: tuple[int, int, int, int], margin: float, side_px: int | None = None
-    ) -> _Window | None:
-        """The image around a box (x0, y0, x1, y1), reduced so that its longer side is at most ``side_px``."""
+    def _window(self, frame: Frame, box: tuple[int, int, int, int], margin: float) -> _Window | None:
+        """The image around a box (x0, y0, x1, y1), reduced to ``work_side_px``; None when hardly any is inside."""
         h, w = frame.rgb.shape[:2]
         m = round(margin)
         x0, y0, x1, y1 = max(0, box[0] - m), max(0, box[1] - m), min(w, box[2] + m), min(h, box[3] + m)
         if x1 - x0 < 8 or y1 - y0 < 8:
             return None
-        scale = min(1.0, (side_px or self._config.work_side_px) / max(x1 - x0, y1 - y0))
+        scale = min(1.0, self._config.work_side_px / max(x1 - x0, y1 - y0))
         size = (max(4, round((x1 - x0) * scale)), max(4, round((y1 - y0) * scale)))
         rgb = cv2.resize(frame.rgb[y0:y1, x0:x1], size, interpolation=cv2.INTER_AREA)
         return _Window(x0, y0, x1 - x0, y1 - y0, scale, rgb)
@@ -337,11 +373,11 @@ class ClassicalSegmenter:
         return (large > 127).astype(np.uint8)
 
 
-def _shrink(mask: Mask, side_px: int = 128) -> NDArray[np.bool_]:
-    """A mask at reduced size, for comparing shapes."""
+def _shrink(mask: Mask, side_px: int) -> Mask:
+    """A 0/1 mask at reduced size, for comparing shapes."""
     scale = min(1.0, side_px / max(mask.shape))
     size = (max(1, round(mask.shape[1] * scale)), max(1, round(mask.shape[0] * scale)))
-    return cv2.resize(mask * 255, size, interpolation=cv2.INTER_AREA) > 127
+    return (cv2.resize(mask * 255, size, interpolation=cv2.INTER_AREA) > 127).astype(np.uint8)
 
 
 def _overlap(a: Mask, b: Mask) -> float:

@@ -19,6 +19,7 @@ Mask = NDArray[np.uint8]
 _COLD_ITERATIONS = 3
 _RING_SHARE = 0.02  # width of the image border taken as background, of the longer side
 _PIECE_SHARE = 0.03  # pieces smaller than this share of the largest are not the target's
+_MOTION_REACH = 0.6  # of the size of what moved: how far beyond it the target may extend
 _SIDES = ("top", "bottom", "left", "right")
 
 
@@ -86,6 +87,19 @@ def cut_from_nothing(rgb: NDArray[np.uint8], open_sides: tuple[str, ...] = ()) -
         views[side](3 * ring)[:] = cv2.GC_PR_FGD
     cut = graph_cut(rgb, labels, ColorModels(), _COLD_ITERATIONS)
     return None if cut is None else tidy(cut, None)
+
+
+def cut_from_motion(rgb: NDArray[np.uint8], moving: Mask) -> Mask | None:
+    """Cut around what moved, (h, w) 0/1: parts of the target, rarely all of it, and nothing far from it."""
+    points = cv2.findNonZero(moving)
+    hull = cv2.fillConvexPoly(np.zeros_like(moving), cv2.convexHull(points), 1)
+    x, y, w, h = cv2.boundingRect(points)
+    reach = round(_MOTION_REACH * max(w, h)) + 2
+    labels = np.full(moving.shape, cv2.GC_BGD, np.uint8)
+    labels[max(0, y - reach) : y + h + reach, max(0, x - reach) : x + w + reach] = cv2.GC_PR_BGD
+    labels[hull > 0] = cv2.GC_PR_FGD
+    cut = graph_cut(rgb, labels, ColorModels(), _COLD_ITERATIONS)
+    return None if cut is None else tidy(cut, moving)
 
 
 def tidy(mask: Mask, anchor: Mask | None) -> Mask | None:
