@@ -13,8 +13,9 @@ import zstandard
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from hat_ros import lie
-from hat_ros.bag import MANIFEST, RESERVE, TYPESTORE, BagReader, BagWriter
+from hat_ros.bag import TYPESTORE, BagReader, BagWriter
 from hat_ros.bag_check import check_mcap
+from hat_ros.bag_files import MANIFEST, RESERVE
 from hat_ros.errors import BagError, FrameError, HatError, RunError
 from hat_ros.nodes import topics
 from hat_ros.nodes.wire import Wire

@@ -7,10 +7,9 @@ once: a node that fails says so in one sentence, in ``/diagnostics`` and on stde
 from __future__ import annotations
 
 import os
-import sys
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar
 
@@ -18,14 +17,12 @@ import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from hat_ros.errors import HatError, RunError
 from hat_ros.nodes import qos, topics
-from hat_ros.nodes.environment import prepare_environment
 from hat_ros.nodes.params import declare_parameters
 from hat_ros.nodes.wire import Wire, message_class
 
@@ -287,51 +284,3 @@ class HatNode(LifecycleNode):
         """Configure and activate, as a lifecycle manager would."""
         if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
             self.trigger_activate()
-
-
-def spin(executor: SingleThreadedExecutor, nodes: Sequence[HatNode]) -> HatError | None:
-    """Run nodes until all have finished, one has failed, or the process is asked to end; the failure if any."""
-    try:
-        while not all(node.finished for node in nodes):
-            failed = next((node for node in nodes if node.failure is not None), None)
-            if failed is not None:
-                return failed.failure
-            executor.spin_once(timeout_sec=0.2)
-    except (ExternalShutdownException, KeyboardInterrupt):
-        pass
-    return None
-
-
-def close(executor: SingleThreadedExecutor, nodes: Sequence[HatNode]) -> None:
-    """Take nodes apart, also after the context was shut down by a signal: what they hold open must be closed."""
-    executor.shutdown()
-    for node in nodes:
-        node.active = False
-        node.release()
-        node.destroy_node()
-
-
-def main(node_classes: Sequence[type[HatNode]], args: Sequence[str] | None = None) -> int:
-    """Entry point of every node process: 0 done, 1 failed, 2 bad input, with one sentence on stderr."""
-    prepare_environment()
-    context = rclpy.Context()
-    rclpy.init(args=list(sys.argv if args is None else args), context=context)
-    executor = SingleThreadedExecutor(context=context)
-    nodes: list[HatNode] = []
-    try:
-        for node_class in node_classes:
-            node = node_class(context=context)
-            nodes.append(node)
-            executor.add_node(node)
-            if node.settings.autostart:
-                node.start()
-        failure = spin(executor, nodes)
-    except HatError as error:
-        failure = error
-    finally:
-        close(executor, nodes)
-        context.try_shutdown()
-    if failure is not None:
-        print(failure, file=sys.stderr)
-        return failure.exit_code
-    return 0

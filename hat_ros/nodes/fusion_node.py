@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hat_ros.core.fusion import FusionStage
-from hat_ros.nodes import base, topics, wire
+from hat_ros.nodes import base, process, topics, wire
 from hat_ros.nodes.stage_node import StageNode
 from hat_ros.refinement import create_refiner
 from hat_ros.types import Camera, Detection, Estimate, Frame
@@ -92,7 +92,7 @@ class FusionNode(StageNode):
 
 def main() -> int:
     """Console script."""
-    return base.main([FusionNode])
+    return process.main([FusionNode])
 
 
 if __name__ == "__main__":

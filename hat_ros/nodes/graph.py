@@ -6,15 +6,13 @@ Every replay has a ROS domain of its own, so that runs side by side, and a robot
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
@@ -29,8 +27,10 @@ from hat_ros.bag import TYPESTORE, BagReader
 from hat_ros.config import HatConfig, config_to_dict
 from hat_ros.errors import ConfigError, HatError, InputError, RunError, StageTimeoutError
 from hat_ros.nodes import base, topics
+from hat_ros.nodes.domain import reserved_domain
 from hat_ros.nodes.environment import prepare_environment
 from hat_ros.nodes.player_node import PlayerNode
+from hat_ros.nodes.process import close as close_nodes
 from hat_ros.nodes.recorder_node import RecorderNode
 from hat_ros.nodes.wire import Status, Wire
 
@@ -44,7 +44,6 @@ _ANSWERS = (
     ("fusion", topics.STATUS),
 )
 _EXIT_TIMEOUT_S = 20.0
-_DOMAINS = range(1, 102)
 
 
 @dataclass(frozen=True)
@@ -128,7 +127,7 @@ def replay(
         config = replace(config, graph=replace(config.graph, credits_replay=credits))
     reader = BagReader(bag, image_topic=image_topic, camera_info_topic=camera_info_topic)
     prepare_environment()
-    with tempfile.TemporaryDirectory(prefix="hat_replay_") as scratch, _free_domain(domain_id) as domain:
+    with tempfile.TemporaryDirectory(prefix="hat_replay_") as scratch, reserved_domain(domain_id) as domain:
         folder = Path(scratch)
         config_file = folder / "config.yaml"
         config_file.write_text(yaml.safe_dump(config_to_dict(config), sort_keys=False), encoding="utf-8")
@@ -313,7 +312,7 @@ class _Run:
                 self._drain()
                 self._record_truth()
         finally:
-            base.close(self._executor, self._nodes)
+            close_nodes(self._executor, self._nodes)
             self._context.try_shutdown()
 
     def _record_truth(self) -> None:
@@ -327,34 +326,3 @@ class _Run:
 
 
 _NO_SIGNALS = rclpy.signals.SignalHandlerOptions.NO
-
-
-@contextlib.contextmanager
-def _free_domain(given: int | None) -> Iterator[int]:
-    """A ROS domain that no other process uses, reserved while the context lasts."""
-    if given is not None:
-        yield given
-        return
-    for domain in _DOMAINS:
-        path = Path(tempfile.gettempdir()) / f"hat_ros_domain_{domain}.lock"
-        with contextlib.ExitStack() as stack:
-            try:
-                lock = stack.enter_context(path.open("a"))
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                continue
-            if _in_use(domain):
-                continue
-            yield domain
-            return
-    raise RunError(f"no free ROS domain among {_DOMAINS.start} to {_DOMAINS.stop - 1}: end other ROS processes")
-
-
-def _in_use(domain: int) -> bool:
-    """Whether some participant listens on the domain's discovery port (RTPS: 7400 + 250 x domain)."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind(("", 7400 + 250 * domain))
-        except OSError:
-            return True
-    return False

@@ -6,7 +6,7 @@ import sys
 from typing import Any
 
 from hat_ros.hypotheses.stage import HypothesisStage
-from hat_ros.nodes import base, topics, wire
+from hat_ros.nodes import process, topics, wire
 from hat_ros.nodes.stage_node import StageNode
 
 
@@ -38,7 +38,7 @@ class HypothesesNode(StageNode):
 
 def main() -> int:
     """Console script."""
-    return base.main([HypothesesNode])
+    return process.main([HypothesesNode])
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from hat_ros.evaluation.overlay import OverlayPainter
-from hat_ros.nodes import base, qos, topics, wire
+from hat_ros.nodes import base, process, qos, topics, wire
 from hat_ros.types import Camera
 
 # Images that may wait for their status; more than the frames in flight.
@@ -71,7 +71,7 @@ class OverlayNode(base.HatNode):
 
 def main() -> int:
     """Console script."""
-    return base.main([OverlayNode])
+    return process.main([OverlayNode])
 
 
 if __name__ == "__main__":

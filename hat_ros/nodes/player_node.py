@@ -12,7 +12,7 @@ import numpy as np
 
 from hat_ros.bag import BagReader, Packet
 from hat_ros.errors import ConfigError, StageTimeoutError
-from hat_ros.nodes import base, qos, topics, wire
+from hat_ros.nodes import base, process, qos, topics, wire
 
 _STAGES = ["segmentation", "hypotheses", "slam", "selector", "fusion"]
 _INPUT_DEPTH = 16
@@ -176,7 +176,7 @@ class PlayerNode(base.HatNode):
 
 def main() -> int:
     """Console script."""
-    return base.main([PlayerNode])
+    return process.main([PlayerNode])
 
 
 if __name__ == "__main__":

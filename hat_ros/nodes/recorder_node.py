@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 from hat_ros.bag import BagWriter, stamp_of_cdr
 from hat_ros.errors import ConfigError
-from hat_ros.nodes import base, qos, topics
+from hat_ros.nodes import base, process, qos, topics
 
 
 class RecorderNode(base.HatNode):
@@ -65,7 +65,7 @@ class RecorderNode(base.HatNode):
 
 def main() -> int:
     """Console script."""
-    return base.main([RecorderNode])
+    return process.main([RecorderNode])
 
 
 if __name__ == "__main__":

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import sys
 import time
-from collections import deque
 from functools import partial
 from typing import Any
 
+from rclpy.duration import Duration
 from std_srvs.srv import Trigger
 
 from hat_ros.core.prior import PriorBuffer
 from hat_ros.core.sync import Admission
 from hat_ros.errors import FrameError, StageTimeoutError
-from hat_ros.nodes import base, qos, topics, wire
-from hat_ros.nodes.images import decode_image, decode_mask
+from hat_ros.nodes import base, process, qos, topics, wire
+from hat_ros.nodes.entrance import Entrance
 from hat_ros.nodes.stage_node import ExtraDelay
 from hat_ros.segmentation.stage import SegmentationStage
-from hat_ros.types import Camera, Frame
+from hat_ros.types import Frame
 
 _STAGES = {"hypotheses", "slam", "selector", "fusion"}
-_MASKS_KEPT = 64
 
 
 class SegmentationNode(base.HatNode):
@@ -32,22 +31,20 @@ class SegmentationNode(base.HatNode):
     def configure(self) -> None:
         """Build the stage and its endpoints."""
         config, live = self.settings.config, self.settings.live
+        annotated = config.segmentation.backend == "annotated"
         self.stage = SegmentationStage(config, self.settings.load_target())
         self.priors = PriorBuffer(config.prior)
+        self.entrance = Entrance(live, annotated)
         self.admission = Admission(1 if live else config.graph.credits_replay)
-        self.dropped_total = self.epoch = 0
-        self._camera: Camera | None = None
-        self._camera_is_new = self._is_open = self._warm = False
+        self.epoch = 0
+        self._camera_sent = self._is_open = self._is_warm = False
         self._ready_nodes: set[str] = set()
-        self._queue: deque[tuple[int, Any]] = deque()
-        self._masks: dict[int, Any] | None = {} if config.segmentation.backend == "annotated" else None
         self._entered_s: dict[int, float] = {}
-        self._last_number: dict[str, int] = {}
         self._delay = ExtraDelay(self.NAME, config.graph.debug_stage_delay_ms)
         for topic in (topics.IMAGE, topics.IMAGE_COMPRESSED):
             self.input(topic, partial(self._on_image, topic), required=False, with_info=True)
         self.input(topics.CAMERA_INFO, self._on_camera_info, required=False)
-        if self._masks is not None:
+        if annotated:
             self.input(topics.DETECTION_MASK, self._on_mask, profile=qos.IN_REPLAY, required=not live)
         self.input(topics.STATUS, self._on_status)
         self.input(topics.READY, self._on_ready, profile=qos.LATCH_READER, required=False)
@@ -69,36 +66,21 @@ class SegmentationNode(base.HatNode):
         """Figures for diagnostics."""
         if self.admission is None:
             return {}
-        flight = len(self.admission.in_flight)
-        return {"admitted": self.admission.seq + 1, "dropped": self.dropped_total, "in_flight": flight}
-
-    # ------------------------------------------------------------ inputs
+        admitted, flight = self.admission.seq + 1, len(self.admission.in_flight)
+        return {"admitted": admitted, "dropped": self.entrance.dropped_total, "in_flight": flight}
 
     def _on_image(self, topic: str, message: Any, info: dict[str, Any]) -> None:
-        number = info["publication_sequence_number"]
-        if number is not None:  # DDS overwrites the newest frame unseen while the stage works: the gap is a drop
-            self.dropped_total += max(0, number - self._last_number.get(topic, number - 1) - 1)
-            self._last_number[topic] = number
-        if self.settings.live and self._queue:
-            self._queue.clear()
-            self.dropped_total += 1
-        self._queue.append((wire.stamp_of(message), message))
+        self.entrance.add_image(topic, message, info["publication_sequence_number"])
         self._pump()
 
     def _on_mask(self, message: Any) -> None:
-        self._masks[wire.stamp_of(message)] = message
-        while len(self._masks) > _MASKS_KEPT:
-            del self._masks[min(self._masks)]
+        self.entrance.add_mask(message)
         self._pump()
 
     def _on_camera_info(self, message: Any) -> None:
-        camera = wire.camera_from(message)
-        if not wire.same_camera(camera, self._camera):
-            if self._camera is not None:
-                if not self.settings.live:
-                    raise FrameError(f"camera_info changes at {wire.stamp_of(message)} ns: a run has one calibration")
-                self._new_epoch()
-            self._camera, self._camera_is_new = camera, True
+        if self.entrance.set_camera(wire.camera_from(message)):
+            self._camera_sent = False
+            self._new_epoch()
         self._pump()
 
     def _on_status(self, message: Any) -> None:
@@ -106,7 +88,7 @@ class SegmentationNode(base.HatNode):
         self.priors.push(estimate)
         if self.admission.answered(estimate.stamp_ns):
             del self._entered_s[estimate.stamp_ns]
-            self._warm = True
+            self._is_warm = True
             self.report(base.OK, "running")
         self._pump()
 
@@ -119,37 +101,28 @@ class SegmentationNode(base.HatNode):
         response.success, response.message = True, f"epoch {self.epoch} begins with the next frame"
         return response
 
-    # ------------------------------------------------------------ admission
-
     def _pump(self) -> None:
         if not self._is_open:
             self._is_open = self._ready_nodes >= _STAGES and not self.unmatched()
-        while self._is_open and self._queue and self._camera is not None and self.admission.has_credit:
-            stamp_ns, message = self._queue[0]
-            if self._masks is not None and stamp_ns not in self._masks:
-                return  # a detector answers every image, if with an empty mask
-            self._queue.popleft()
+        while self._is_open and self.admission.has_credit:
             try:
-                self.admission.check(stamp_ns)
-                frame = self._decode(stamp_ns, message)
+                found = self.entrance.next_frame(self.admission)
             except FrameError as error:
-                self.dropped_total += 1
-                self.report(base.WARN, f"frame {stamp_ns} rejected: {error}")
+                self.report(base.WARN, str(error))
                 continue
-            self._admit(frame, message.header.frame_id)
-
-    def _decode(self, stamp_ns: int, message: Any) -> Frame:
-        mask = None if self._masks is None else decode_mask(self._masks.pop(stamp_ns))
-        return Frame(stamp_ns, decode_image(message), self._camera, mask)
+            if found is None:
+                return
+            self._admit(*found)
 
     def _admit(self, frame: Frame, frame_id: str) -> None:
         stamp_ns = frame.stamp_ns
-        if self._camera_is_new:
-            self._camera_is_new = False
+        if not self._camera_sent:
+            self._camera_sent = True
             self._camera_info.publish(self.wire.camera_info(stamp_ns, frame_id, frame.camera))
+            self._camera_info.wait_for_all_acked(Duration(seconds=5))  # it must be there before its first image
         seq = self.admission.admit(stamp_ns)
         self._entered_s[stamp_ns] = time.monotonic()
-        admitted = wire.Admitted(seq, self.dropped_total, self.epoch)
+        admitted = wire.Admitted(seq, self.entrance.dropped_total, self.epoch)
         self._admission.publish(self.wire.admission(stamp_ns, frame_id, admitted))
         self._delay.wait()
         detection = self.stage.update(frame, self.priors.before(stamp_ns))
@@ -157,15 +130,17 @@ class SegmentationNode(base.HatNode):
 
     def _check_time(self) -> None:
         """A stage that does not answer: a replay ends, a live graph goes on in a new epoch."""
-        oldest = min(self._entered_s, key=self._entered_s.get, default=None)
+        oldest = next(iter(self._entered_s), None)
         graph = self.settings.config.graph
-        limit_s = graph.stage_timeout_s if self._warm else graph.startup_timeout_s  # the first frame compiles code
+        limit_s = graph.stage_timeout_s if self._is_warm else graph.startup_timeout_s  # the first frame compiles code
         if oldest is not None and time.monotonic() - self._entered_s[oldest] > limit_s:
             self.admission.give_up()
             self._entered_s.clear()
             self._new_epoch()
             self._is_open = False
             self.fail(StageTimeoutError(f"no status for frame {oldest} within {limit_s:g} s: {base.HANGS}"))
+        elif self._is_open and len(self.entrance) and self.entrance.camera is None:
+            self.report(base.WARN, f"images arrive, but no calibration on {topics.CAMERA_INFO}")
         self._pump()
 
     def _new_epoch(self) -> None:
@@ -176,7 +151,7 @@ class SegmentationNode(base.HatNode):
 
 def main() -> int:
     """Console script."""
-    return base.main([SegmentationNode])
+    return process.main([SegmentationNode])
 
 
 if __name__ == "__main__":

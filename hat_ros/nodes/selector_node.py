@@ -6,7 +6,7 @@ import sys
 from typing import Any
 
 from hat_ros.core.selector import SelectorStage
-from hat_ros.nodes import base, topics, wire
+from hat_ros.nodes import process, topics, wire
 from hat_ros.nodes.stage_node import StageNode
 
 
@@ -39,7 +39,7 @@ class SelectorNode(StageNode):
 
 def main() -> int:
     """Console script."""
-    return base.main([SelectorNode])
+    return process.main([SelectorNode])
 
 
 if __name__ == "__main__":

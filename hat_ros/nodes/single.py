@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from hat_ros.nodes import base
+from hat_ros.nodes import process
 from hat_ros.nodes.fusion_node import FusionNode
 from hat_ros.nodes.hypotheses_node import HypothesesNode
 from hat_ros.nodes.segmentation_node import SegmentationNode
@@ -14,7 +14,7 @@ from hat_ros.nodes.slam_node import SlamNode
 
 def main() -> int:
     """Run the graph; ends like a single node does."""
-    return base.main([SegmentationNode, HypothesesNode, SlamNode, SelectorNode, FusionNode])
+    return process.main([SegmentationNode, HypothesesNode, SlamNode, SelectorNode, FusionNode])
 
 
 if __name__ == "__main__":

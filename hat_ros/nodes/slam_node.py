@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from hat_ros.nodes import base, topics, wire
+from hat_ros.nodes import process, topics, wire
 from hat_ros.nodes.stage_node import StageNode
 from hat_ros.slam.stage import MotionStage
 
@@ -38,7 +38,7 @@ class SlamNode(StageNode):
 
 def main() -> int:
     """Console script."""
-    return base.main([SlamNode])
+    return process.main([SlamNode])
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 
 import hat_ros
 from hat_ros.errors import ConfigError
-from hat_ros.nodes import base, images, topics, wire
+from hat_ros.nodes import base, images, process, topics, wire
 from hat_ros.nodes.overlay_node import OverlayNode
 from hat_ros.nodes.recorder_node import RecorderNode
 from hat_ros.nodes.selector_node import SelectorNode
@@ -29,7 +29,7 @@ def executor():
     rclpy.init(args=[], context=context, domain_id=115)
     executor = SingleThreadedExecutor(context=context)
     yield executor
-    base.close(executor, [node for node in executor.get_nodes() if isinstance(node, base.HatNode)])
+    process.close(executor, [node for node in executor.get_nodes() if isinstance(node, base.HatNode)])
     context.try_shutdown()
 
 
