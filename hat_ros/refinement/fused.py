@@ -12,7 +12,14 @@ from hat_ros.refinement.covariance import pose_covariance
 from hat_ros.refinement.refiner import WITH_MASK, WITHOUT_MASK, PoseFitter
 from hat_ros.refinement.view import MaskField, TargetViewer
 from hat_ros.target import Target
-from hat_ros.types import Detection, Frame, Refined
+from hat_ros.types import Camera, Detection, Frame, Refined
+
+# The mask's robust scales are meant for a target of this size or more and shrink with smaller ones.
+_USUAL_SIZE_PX = 250.0
+_SCALE_LIMITS = (0.4, 1.0)
+# Silhouette and mask that overlap this much need no centring; judged on a view of this size.
+_CENTRED_OVERLAP = 0.75
+_CENTRING_PX = 64
 
 
 class FusedPoseRefiner:
@@ -42,9 +49,15 @@ class FusedPoseRefiner:
             measured, or the refinement would leave the basin.
         """
         field = MaskField(detection.mask) if detection is not None and detection.silhouette else None
-        rounds = WITHOUT_MASK if field is None else WITH_MASK
-        fit = self._fitter.fit(T_cam_target, frame.camera, frame.rgb, field, rounds)
-        if fit is None or not self._same_basin(T_cam_target, fit.T_cam_target):
+        luma = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+        rounds, start = WITHOUT_MASK, T_cam_target
+        if field is not None:
+            factor = float(np.clip(field.size_px / _USUAL_SIZE_PX, *_SCALE_LIMITS))
+            rounds = (WITH_MASK[0].scaled(factor), *WITH_MASK[1:])
+            start = self._centred(T_cam_target, frame.camera, field, luma)
+        sigma = np.radians(self._config.start_sigma_deg)
+        fit = self._fitter.fit(start, frame.camera, frame.rgb, field, rounds, sigma)
+        if fit is None or not self._same_basin(start, fit.T_cam_target):
             return None
         covariance = pose_covariance(fit, self._target.bounding_radius_m)
         if covariance is None:
@@ -52,12 +65,38 @@ class FusedPoseRefiner:
         # The last round starts where the one before it converged: its view is the result's but for part of a pixel.
         overlap = visible_overlap = float("nan")
         if field is not None:
-            areas = field.compare(fit.view, cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY))
+            areas = field.compare(fit.view, luma)
             overlap, visible_overlap = areas.union_share, areas.visible_share
         return Refined(lie.row_from_matrix(fit.T_cam_target), covariance, overlap, fit.support, visible_overlap)
 
     def reset(self) -> None:
         """Nothing to forget: every frame stands for itself."""
+
+    def _centred(
+        self, T_cam_target: NDArray[np.float64], camera: Camera, field: MaskField, luma: NDArray[np.uint8]
+    ) -> NDArray[np.float64]:
+        """The start moved sideways so that silhouette and mask share their centroid, where that brings them closer.
+
+        Rotation is predicted better than position: a target that drifts across the image leaves the capture range of
+        the outline long before it turns out of it.
+        """
+        view = self._viewer.view(T_cam_target, camera, _CENTRING_PX)
+        if view is None:
+            return T_cam_target
+        areas = field.compare(view, luma)
+        if areas.visible_share > _CENTRED_OVERLAP:
+            return T_cam_target
+        pixels = np.argwhere(view.mask)[:, ::-1] / view.scale + view.origin_px
+        pixels = pixels[((pixels > -0.5) & (pixels < np.array(luma.shape[::-1]) - 0.5)).all(axis=1)]
+        if not len(pixels):
+            return T_cam_target
+        shift = np.linalg.solve(camera.K, np.append(field.centroid_px - pixels.mean(axis=0), 0.0))
+        moved = T_cam_target.copy()
+        center_z = T_cam_target[2, :3] @ self._target.center_m + T_cam_target[2, 3]
+        moved[:3, 3] += center_z * shift
+        view = self._viewer.view(moved, camera, _CENTRING_PX)
+        closer = view is not None and field.compare(view, luma).visible_share > areas.visible_share
+        return moved if closer else T_cam_target
 
     def _same_basin(self, T_before: NDArray[np.float64], T_after: NDArray[np.float64]) -> bool:
         turn = np.degrees(lie.angle_between(T_before[:3, :3], T_after[:3, :3]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,10 @@ class Schedule:
     edge: tuple[float, ...]
     mask: tuple[float, ...]
     damping: float = 1e-3
+
+    def scaled(self, factor: float) -> Schedule:
+        """The same with the mask's robust scales multiplied."""
+        return replace(self, mask=tuple(factor * scale for scale in self.mask))
 
 
 # The mask leads the way, then the image's own edges take over; without a mask long lines lead the way.
@@ -95,15 +99,16 @@ class PoseFitter:
         image: NDArray[np.uint8],
         field: MaskField | None,
         rounds: tuple[Schedule, ...],
+        prior_sigma_rad: float = np.inf,
     ) -> Fit | None:
-        """Refine; None when the target leaves the view on the way."""
+        """Refine a pose whose rotation is known to a sigma; None when the target leaves the view on the way."""
         T = T_cam_target
         fit = None
         for schedule in rounds:
             view = self.viewer.view(T, camera, self._render_px)
             if view is None:
                 return None
-            fit = self.iterate(T, view, camera, image, field, schedule)
+            fit = self.iterate(T, view, camera, image, field, schedule, prior_sigma_rad)
             T = fit.T_cam_target
         return fit
 
@@ -131,6 +136,7 @@ class PoseFitter:
             scales_px,
             off,
             np.full(len(scales_px), _PULL_DAMPING),
+            np.inf,
             self.viewer.target.bounding_radius_m,
         )
         return lie.transform(R, t)
@@ -143,8 +149,9 @@ class PoseFitter:
         image: NDArray[np.uint8],
         field: MaskField | None,
         schedule: Schedule,
+        prior_sigma_rad: float = np.inf,
     ) -> Fit:
-        """One round with the contour of a view rendered at the start pose."""
+        """One round with the contour of a view rendered at the start pose, whose rotation is known to a sigma."""
         lines = contour_lines(view, T_cam_target, self._max_points)
         R, t, H, contour, mask_bias, _ = fit_contour(
             lines.points_m,
@@ -159,6 +166,7 @@ class PoseFitter:
             np.array(schedule.mask, dtype=np.float64),
             np.array(schedule.edge, dtype=np.float64),
             np.full(len(schedule.reach), schedule.damping),
+            prior_sigma_rad,
             self.viewer.target.bounding_radius_m,
         )
         return Fit(lie.transform(R, t), H, contour, lines.lines, mask_bias, view)

@@ -254,6 +254,7 @@ def fit_contour(
     mask_scales_px: Array,
     edge_scales_px: Array,
     dampings: Array,
+    prior_sigma_rad: float,
     radius_m: float,
 ) -> tuple[Array, Array, Array, Array, float, float]:
     """Fit contour points to a mask's boundary and to the image's own edges, each weighted by its measured variance.
@@ -270,12 +271,13 @@ def fit_contour(
         mask_scales_px: (I,) robust scale of the mask residuals in each iteration, 0 = mask unused.
         edge_scales_px: (I,) robust scale of the edge residuals.
         dampings: (I,) share of the mean information added in every direction, so that what cannot be observed stays.
+        prior_sigma_rad: one sigma of the start's rotation, which holds what the contour says little about; inf = none.
         radius_m: bounding radius of the target, which makes rotations and translations commensurate.
 
     Returns:
-        R, t, information (8, 8) of pose, mask bias and edge bias in the last iteration, before its step, and per point
-        (N, 5): in the image (0/1), mask distance, its robust weight, edge offset, its weight (0 = no edge found); mask
-        bias and edge bias in pixels.
+        R, t, information (8, 8) of pose, mask bias and edge bias in the last iteration, before its step and without the
+        prior, and per point (N, 5): in the image (0/1), mask distance, its robust weight, edge offset, its weight
+        (0 = no edge found); mask bias and edge bias in pixels.
     """
     n = len(points)
     row, mask_at = np.zeros(N_PARAMETERS), np.empty(3)
@@ -285,6 +287,7 @@ def fit_contour(
     shape = (N_PARAMETERS, N_PARAMETERS)
     H = np.zeros(shape)
     mask_bias, edge_bias = 0.0, 0.0
+    turned = np.zeros(3)
     correlation = CORRELATION_PX
     for i in range(n):
         correlation += CORRELATION_SHARE * lines[i, 2]
@@ -342,10 +345,15 @@ def fit_contour(
         H[EDGE_BIAS, EDGE_BIAS] += 1.0 / EDGE_BIAS_PX**2
         g[MASK_BIAS] -= mask_bias / MASK_BIAS_PX**2
         g[EDGE_BIAS] -= edge_bias / EDGE_BIAS_PX**2
-        ok, step = _damped_solve(H, g, dampings[iteration], radius_m)
+        A = H.copy()
+        for i in range(3):
+            A[i + 3, i + 3] += 1.0 / prior_sigma_rad**2
+            g[i + 3] -= turned[i] / prior_sigma_rad**2
+        ok, step = _damped_solve(A, g, dampings[iteration], radius_m)
         if not ok:
             break
         R, t = _update_pose(R, t, step)
+        turned += step[3:6]
         mask_bias += step[MASK_BIAS]
         edge_bias += step[EDGE_BIAS]
     return R, t, H, state, mask_bias, edge_bias

@@ -153,6 +153,12 @@ class MaskField:
         self.area_px = float(np.count_nonzero(mask))
         rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         self.size_px = float(max(np.ptp(rows), np.ptp(cols)) + 1)
+        part = mask[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
+        x_counts, y_counts = np.count_nonzero(part, axis=0), np.count_nonzero(part, axis=1)
+        self.centroid_px = (
+            np.array([x_counts @ np.arange(cols[0], cols[-1] + 1), y_counts @ np.arange(rows[0], rows[-1] + 1)])
+            / self.area_px
+        )
         margin = int(max(_MIN_MARGIN_PX, _MARGIN_SHARE * self.size_px))
         # Beyond the image border nothing is known: the border pixels continue, so that a cut is no contour.
         height, width = mask.shape
