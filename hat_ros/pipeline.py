@@ -128,10 +128,11 @@ class Pipeline:
         start, start_cpu = time.perf_counter(), time.process_time()
         step = self._method.step(seen)
         latency_ms, cpu_ms = 1e3 * (time.perf_counter() - start), 1e3 * (time.process_time() - start_cpu)
-        iou = float("nan")
-        if frame.given_mask is not None and (silhouette := frame.given_mask == 255).any():
+        stage_ms, iou = self._clock.take(), float("nan")
+        looked = step.detection is not None or stage_ms["segmentation"] > 0
+        if looked and frame.given_mask is not None and (silhouette := frame.given_mask == 255).any():
             iou = mask_iou(None if step.detection is None else step.detection.mask, silhouette)
-        return Processed(frame, step, latency_ms, cpu_ms, decode_ms, self._clock.take(), resident_mib(), iou)
+        return Processed(frame, step, latency_ms, cpu_ms, decode_ms, stage_ms, resident_mib(), iou)
 
 
 def resident_mib() -> float:
