@@ -76,6 +76,8 @@ def track(spec: SourceSpec, out: Path, config: HatConfig, options: TrackOptions,
     """
     folder = ResultFolder(out, options.overwrite)
     source = spec.open()
+    if source.count(options.start, options.limit) == 0:
+        raise UsageError(f"{spec.path} has {source.count()} frames, --start {options.start} leaves none")
     method = create_method(options.mode, config, source.target)
     pipeline = Pipeline(method, config.segmentation.backend in GIVEN_MASK_BACKENDS)
     how = {"mode": options.mode, "start": options.start, "limit": options.limit}
@@ -227,6 +229,8 @@ def _run(
                 bag.write_step(step, pipeline.rejected)
         finally:
             bag.write_context(source.recording.camera, source.truth_rows())
+    if not rows:
+        raise RunError(f"no frame of {source.path} could be used, {pipeline.rejected} were rejected (stamp or image)")
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     overlap = np.array([row[MEASURED.index("mask_iou")] for row in rows])
     return latency_summary(rows) | mask_summary(overlap) | {"peak_memory_mib": peak_mib} | memory_summary(rows)

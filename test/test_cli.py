@@ -80,6 +80,7 @@ BAD_INPUT = [
     (["track", "{bag}", "--out", "{tmp}/out", "--config", "{settings}", "--set", "keyframes.gap=1"], "gap_frames"),
     (["track", "{bag}", "--out", "{tmp}/out", "--config", "{settings}", "--set", "keyframes"], "section.key=value"),
     (["track", "{bag}", "--out", "{bag}", "--overwrite"], "not a result folder"),
+    (["track", "{bag}", "--out", "{tmp}/out", "--config", "{settings}", "--start", "10"], "leaves none"),
     (["replay", "{tmp}/none", "--out", "{tmp}/out", "--config", "{settings}"], "no such file"),
     (["temporal", "{tmp}/none.npz", "--out", "{tmp}/o.npz", "--config", "{settings}"], "no such file"),
     (["evaluate", "{tmp}"], "no finished result folder"),
@@ -204,6 +205,17 @@ def test_stopped_run_leaves_readable_results(monkeypatch, bag, settings, tmp_pat
     from hat_ros.result_bag import read_result_bag
 
     assert len(read_result_bag(left / "bag")) == 6
+
+
+def test_recording_without_a_usable_frame_is_a_failed_run(scripted, settings, tmp_path, capsys):
+    model = tmp_path / "cubesat.glb"
+    write_model("cubesat", model)
+    with BagWriter(tmp_path / "bad", image_format="png") as writer:
+        for i in range(3):
+            writer.write_frame(stamp(i), b"\xff\xd8 no picture", CAMERA)
+        writer.write_target(model)
+    assert main(["track", str(tmp_path / "bad"), "--out", str(tmp_path / "out"), "--config", settings]) == 1
+    assert "3 were rejected" in capsys.readouterr().err
 
 
 def test_doctor_knows_this_machine(capsys):
