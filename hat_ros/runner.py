@@ -132,9 +132,9 @@ def replay_bag(
     """
     try:
         from hat_ros.nodes import graph
-    except ModuleNotFoundError as error:
+    except ImportError as error:
         raise MissingDependencyError(
-            f"hat replay needs ROS ('{error.name}' is not installed): run `make install`, source your ROS, "
+            f"hat replay needs ROS, which cannot be imported ({error}): run `make install`, source your ROS, "
             f"or use `hat track`, which needs none"
         ) from None
     folder = ResultFolder(out, options.overwrite)
