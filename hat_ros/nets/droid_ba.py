@@ -266,11 +266,15 @@ def _damped(H: Tensor, damping: Damping) -> Tensor:
 
 
 def _solve(A: Tensor, b: Tensor) -> Tensor:
-    """Cholesky solution of the poses (P, 6); zero if the matrix is not positive definite."""
+    """Cholesky solution of the poses (P, 6): zero if the matrix is not positive definite, NaN if it is not finite.
+
+    NaN is let through, so that whoever reads the poses notices; a step of zero would hide it for good.
+    """
     factor, info = torch.linalg.cholesky_ex(A)
     step = torch.cholesky_solve(b.double().reshape(-1, 1), factor).view_as(b)
-    sound = (info == 0) & step.isfinite().all()
-    return torch.where(sound, step, torch.zeros_like(step)).to(b.dtype)
+    step = torch.where(info == 0, step, torch.zeros_like(step))
+    finite = A.isfinite().all() & b.isfinite().all()
+    return torch.where(finite, step, torch.full_like(step, float("nan"))).to(b.dtype)
 
 
 def _eliminate(

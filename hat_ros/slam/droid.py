@@ -5,6 +5,8 @@ This is the only place where DROID's camera-from-world poses are turned into ``T
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+
 import cv2
 import numpy as np
 import torch
@@ -16,6 +18,7 @@ from hat_ros.errors import ConfigError
 from hat_ros.nets.droid import STRIDE_PX, DroidNet
 from hat_ros.slam.droid_frontend import DroidFrontend
 from hat_ros.slam.droid_keyframes import FlowModel
+from hat_ros.slam.droid_offline import finish
 from hat_ros.target import Target
 from hat_ros.types import Camera, Detection, Frame, Motion, PosePrior
 
@@ -28,7 +31,8 @@ class DroidSlam:
     """Target-relative camera motion by DROID-SLAM.
 
     No motion is given before the warm-up's keyframes are there, and, while the background is suppressed, none for
-    frames without a detection, which do not reach the tracker. A change of the camera and a result that is not finite start a new epoch.
+    frames without a detection, which do not reach the tracker. A change of the camera and a result that is not finite
+    start a new epoch.
 
     Args:
         config: the whole configuration; ``slam.droid`` is used.
@@ -81,11 +85,51 @@ class DroidSlam:
         """Keyframes held."""
         return len(self._frontend.keyframes) if self._frontend else 0
 
-    def _new_frontend(self, image: NDArray[np.uint8], intrinsics: NDArray[np.float64]) -> DroidFrontend:
+    def _new_frontend(
+        self, image: NDArray[np.uint8], intrinsics: NDArray[np.float64], keep_all: bool = False
+    ) -> DroidFrontend:
         shape = image.shape[2] // STRIDE_PX, image.shape[3] // STRIDE_PX
         rows = torch.tensor(intrinsics / STRIDE_PX, dtype=torch.float32, device=self._device)
         stored = self._config.correlation == "stored"
-        return DroidFrontend(self._config, self._model, rows, shape, stored=stored)
+        return DroidFrontend(self._config, self._model, rows, shape, keep_all=keep_all, stored=stored)
+
+
+@torch.inference_mode()
+def offline_motions(
+    config: HatConfig, clip: Sequence[tuple[Frame, Detection | None]], model: FlowModel | None = None
+) -> list[Motion]:
+    """Motion of a whole clip by global optimisation: the non-causal reference of :class:`DroidSlam`.
+
+    Args:
+        config: the whole configuration; ``slam.droid`` is used.
+        clip: frames of one camera, their background suppressed already, with their detections.
+        model: the flow network; default is the public one.
+
+    Returns:
+        One motion per frame, none where there was no detection; all in one epoch.
+
+    Raises:
+        RunError: the clip has too little motion for the warm-up.
+        WeightsError: the public weights are missing or altered.
+        ConfigError: the device does not exist.
+    """
+    slam = DroidSlam(config, None, model)
+    used = [not config.slam.masked or (d is not None and bool(d.mask.any())) for _, d in clip]
+    frames = [frame for (frame, _), use in zip(clip, used, strict=True) if use]
+    if not frames:
+        return [Motion.none() for _ in clip]
+
+    def images() -> Iterator[tuple[int, torch.Tensor]]:
+        for frame in frames:
+            yield frame.stamp_ns, torch.from_numpy(prepare(frame, config.slam.droid)[0]).to(slam._device)
+
+    image, intrinsics = prepare(frames[0], config.slam.droid)
+    frontend = slam._new_frontend(image, intrinsics, keep_all=True)
+    for stamp_ns, image_bgr in images():
+        frontend.track(stamp_ns, image_bgr)
+    rows = iter(slam_rows(finish(frontend, images()).double().cpu().numpy()))
+    n = len(frontend.keyframes)
+    return [Motion(True, 0, next(rows), n) if use else Motion.none(0, n) for use in used]
 
 
 def prepare(frame: Frame, config: DroidConfig) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:

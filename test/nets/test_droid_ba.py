@@ -188,9 +188,15 @@ def test_without_confidence_nothing_moves(data):
     assert torch.allclose(disparities, tensor(data["disps_init"]), atol=1e-6)
 
 
-def test_numbers_that_are_not_finite_leave_the_poses(data):
+def test_numbers_that_are_not_finite_are_not_hidden(data):
     broken = data | {"target": np.full_like(data["target"], np.nan)}
     poses, _ = solve(broken, iterations=1)
+    assert poses[1:].isnan().all() and torch.equal(poses[0], tensor(data["poses_init"][0]))
+
+
+def test_a_singular_system_is_left_alone(data):
+    blind = data | {"weight": np.zeros_like(data["weight"])}
+    poses, _ = solve(blind, damping=Damping(0.0, -1.0))
     assert torch.allclose(poses, tensor(data["poses_init"]), atol=1e-6)
 
 

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from flow_oracle import FlowOracle, make_clip, similarity_errors, track
+from flow_oracle import SMALL, FlowOracle, make_clip, oracle_config, similarity_errors, track
 from weight_rule import rule_filled
 
-from hat_ros.config import DroidConfig, HatConfig, SlamConfig
+from hat_ros.config import DroidConfig
 from hat_ros.nets.droid import DroidNet
 from hat_ros.slam import droid_frontend
 from hat_ros.slam.droid import DroidSlam
@@ -170,19 +170,10 @@ def test_read_out_leaves_no_trace(net, read_out_state, depths):
 
 # --- true flow -------------------------------------------------------------------------------------------------------
 
-SMALL = {"width": 160, "height": 128, "focal": 190.0, "step_deg": 3.0, "range_m": 4.5}
-
-
-def oracle_config(clip, **options):
-    area = clip.frames[0].camera.width * clip.frames[0].camera.height
-    settings = {"filter_threshold": 0.5, "keyframe_threshold": 0.4, "readout_depths": True, "as_released": False}
-    return HatConfig(slam=SlamConfig(backend="droid", droid=DroidConfig(input_area_px=area, **(settings | options))))
-
 
 def run_oracle(clip, **options):
-    oracle = FlowOracle(clip)
-    slam = DroidSlam(oracle_config(clip, **options), None, oracle)
-    return slam, track(slam, clip, oracle)
+    slam = DroidSlam(oracle_config(clip, **options), None, FlowOracle(clip))
+    return slam, track(slam, clip)
 
 
 def rows(motions):
@@ -213,10 +204,8 @@ def test_true_flow_gives_back_the_planted_trajectory(clip, oracle_run):
 def test_every_pose_is_causal_and_frozen(clip, oracle_run):
     """The first frames alone give the same bytes."""
     _, motions = oracle_run
-    oracle = FlowOracle(clip)
-    slam = DroidSlam(oracle_config(clip), None, oracle)
+    slam = DroidSlam(oracle_config(clip), None, FlowOracle(clip))
     for i in range(50):
-        oracle.frame = i
         motion = slam.update(clip.frames[i], clip.detections[i], None)
         assert motion.valid == motions[i].valid
         assert np.array_equal(motion.pose_row, motions[i].pose_row, equal_nan=True)
@@ -241,11 +230,9 @@ def test_retiring_keyframes_changes_nothing(clip, monkeypatch, as_released):
 def test_true_flow_over_300_frames(depths):
     """More than a full turn of the target; memory is flat because slots and edges are bounded."""
     clip = make_clip(300, range_m=4.5)
-    oracle = FlowOracle(clip)
-    slam = DroidSlam(oracle_config(clip, frontend_window=12, readout_depths=depths), None, oracle)
+    slam = DroidSlam(oracle_config(clip, frontend_window=12, readout_depths=depths), None, FlowOracle(clip))
     motions, sizes = [], []
-    for i, (frame, detection) in enumerate(zip(clip.frames, clip.detections, strict=True)):
-        oracle.frame = i
+    for frame, detection in zip(clip.frames, clip.detections, strict=True):
         motions.append(slam.update(frame, detection, None))
         frontend = slam._frontend
         sizes.append((frontend.keyframes.capacity, len(frontend.graph), len(frontend.graph.ii_inactive)))

@@ -11,11 +11,14 @@ import torch
 import trimesh
 
 from hat_ros import lie
+from hat_ros.config import DroidConfig, HatConfig, SlamConfig
 from hat_ros.render.embree import EmbreeRenderer
 from hat_ros.target import target_from_scene
 from hat_ros.types import Camera, Detection, Frame
 
 STRIDE = 8
+# A clip that one core tracks in a few seconds.
+SMALL = {"width": 160, "height": 128, "focal": 190.0, "step_deg": 3.0, "range_m": 4.5}
 
 
 def satellite():
@@ -44,6 +47,11 @@ def tumbling_poses(n_frames, step_deg=1.5, range_m=6.5):
     return np.stack(poses)
 
 
+def numbered_image(number, height, width):
+    """An image that says which frame of the clip it is; nothing else reads it."""
+    return np.broadcast_to(np.array([number // 256, number % 256, 0], np.uint8), (height, width, 3))
+
+
 @dataclass
 class Clip:
     """Frames with their masks, the true poses, and depth at every eighth pixel."""
@@ -57,34 +65,39 @@ class Clip:
 
 def make_clip(n_frames, width=256, height=192, focal=230.0, frame_ns=100_000_000, **motion):
     """A rendered clip."""
-    camera = Camera(
-        np.array([[focal, 0, width / 2 - 4], [0, focal, height / 2 - 4], [0, 0, 1.0]]), width, height
-    )
+    camera = Camera(np.array([[focal, 0, width / 2 - 4], [0, focal, height / 2 - 4], [0, 0, 1.0]]), width, height)
     K8 = camera.K / STRIDE
     K8[2, 2] = 1
     small = Camera(K8, width // STRIDE, height // STRIDE)
     renderer = EmbreeRenderer(satellite())
     poses = tumbling_poses(n_frames, **motion)
-    blank = np.zeros((height, width, 3), np.uint8)
     depth8 = np.stack([renderer.render(T, small, color=False).depth_m for T in poses])
-    frames = [Frame((i + 1) * frame_ns, blank, camera) for i in range(n_frames)]
+    frames = [Frame((i + 1) * frame_ns, numbered_image(i, height, width), camera) for i in range(n_frames)]
     detections = [Detection(np.kron(depth > 0, np.ones((STRIDE, STRIDE))).astype(bool)) for depth in depth8]
     return Clip(frames, detections, poses, depth8, K8)
 
 
+def oracle_config(clip, **options):
+    """Thresholds for these small images; all corrections on."""
+    area = clip.frames[0].camera.width * clip.frames[0].camera.height
+    settings = {"filter_threshold": 0.5, "keyframe_threshold": 0.4, "readout_depths": True, "as_released": False}
+    return HatConfig(slam=SlamConfig(backend="droid", droid=DroidConfig(input_area_px=area, **(settings | options))))
+
+
 class FlowOracle:
-    """True flow in place of the network. Set ``frame`` before each frame is tracked."""
+    """True flow in place of the network; which frame an image is, the image itself says."""
 
     dtype = torch.float32
 
     def __init__(self, clip, damping=5e-3):
-        self.clip, self.frame, self._damping = clip, 0, damping
+        self.clip, self._damping = clip, damping
         h, w = clip.depth8.shape[1:]
         y, x = np.mgrid[:h, :w]
         self._rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(clip.K8).T
 
     def features(self, images_bgr):
-        depth, T = self.clip.depth8[self.frame], self.clip.T_cam_target[self.frame]
+        number = int(images_bgr[0, 2, 0, 0]) * 256 + int(images_bgr[0, 1, 0, 0])
+        depth, T = self.clip.depth8[number], self.clip.T_cam_target[number]
         points = (self._rays * depth[..., None] - T[:3, 3]) @ T[:3, :3]
         pose = np.broadcast_to(T[:3].reshape(12), (*depth.shape, 12))
         stacked = np.concatenate([points, depth[..., None], pose], axis=-1).transpose(2, 0, 1)
@@ -136,13 +149,9 @@ class TrueFlow:
         self.seen = torch.cat([self.seen, other.seen])
 
 
-def track(slam, clip, oracle):
+def track(slam, clip):
     """Motions of the whole clip."""
-    out = []
-    for i, (frame, detection) in enumerate(zip(clip.frames, clip.detections, strict=True)):
-        oracle.frame = i
-        out.append(slam.update(frame, detection, None))
-    return out
+    return [slam.update(frame, seen, None) for frame, seen in zip(clip.frames, clip.detections, strict=True)]
 
 
 def similarity_errors(T_slam_cam, T_cam_target):
