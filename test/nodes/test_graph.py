@@ -183,7 +183,7 @@ def test_a_stage_that_hangs_is_named(clean_bag, config, tmp_path):
         if progress.done == 3:
             os.kill(node_pid("hypotheses"), signal.SIGSTOP)
 
-    impatient = changed(config, graph={"stage_timeout_s": 2.0})
+    impatient = changed(config, graph={"stage_timeout_s": 6.0})
     with pytest.raises(StageTimeoutError, match="stage 'hypotheses' has answered"):
         play(clean_bag, impatient, tmp_path / "out", on_progress=stop)
     assert len(read_result_bag(tmp_path / "out")) >= 3
