@@ -17,8 +17,9 @@ from hat_ros.types import Camera, Detection, Frame, Refined
 # The mask's robust scales are meant for a target of this size or more and shrink with smaller ones.
 _USUAL_SIZE_PX = 250.0
 _SCALE_LIMITS = (0.4, 1.0)
-# Silhouette and mask that overlap this much need no centring; judged on a view of this size.
-_CENTRED_OVERLAP = 0.75
+# A silhouette that leaves out more than this share of the mask is off centre (a mask may lack dark parts of the target,
+# but little of it lies beside the target); judged on a view of this size.
+_BESIDE_SHARE = 0.15
 _CENTRING_PX = 64
 
 
@@ -75,7 +76,7 @@ class FusedPoseRefiner:
     def _centred(
         self, T_cam_target: NDArray[np.float64], camera: Camera, field: MaskField, luma: NDArray[np.uint8]
     ) -> NDArray[np.float64]:
-        """The start moved sideways so that silhouette and mask share their centroid, where that brings them closer.
+        """The start moved sideways so that silhouette and mask share their centroid, if that covers the mask.
 
         Rotation is predicted better than position: a target that drifts across the image leaves the capture range of
         the outline long before it turns out of it.
@@ -84,7 +85,7 @@ class FusedPoseRefiner:
         if view is None:
             return T_cam_target
         areas = field.compare(view, luma)
-        if areas.visible_share > _CENTRED_OVERLAP:
+        if areas.extra <= _BESIDE_SHARE * field.area_px:
             return T_cam_target
         pixels = np.argwhere(view.mask)[:, ::-1] / view.scale + view.origin_px
         pixels = pixels[((pixels > -0.5) & (pixels < np.array(luma.shape[::-1]) - 0.5)).all(axis=1)]
@@ -95,7 +96,7 @@ class FusedPoseRefiner:
         center_z = T_cam_target[2, :3] @ self._target.center_m + T_cam_target[2, 3]
         moved[:3, 3] += center_z * shift
         view = self._viewer.view(moved, camera, _CENTRING_PX)
-        closer = view is not None and field.compare(view, luma).visible_share > areas.visible_share
+        closer = view is not None and field.compare(view, luma).extra < 0.5 * areas.extra
         return moved if closer else T_cam_target
 
     def _same_basin(self, T_before: NDArray[np.float64], T_after: NDArray[np.float64]) -> bool:
