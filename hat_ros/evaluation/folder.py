@@ -16,11 +16,13 @@ from hat_ros.evaluation.overlay import OverlayPainter, VideoFile
 from hat_ros.evaluation.report import write_report
 from hat_ros.evaluation.runlog import RunLog
 from hat_ros.evaluation.score import score_run, write_json
+from hat_ros.evaluation.temporal_replay import save_observations
 from hat_ros.result_bag import read_result_bag
 from hat_ros.results import BAG_FOLDER, CONFIG_FILE, METRICS_FILE, RUN_FILE, write_tables
 from hat_ros.source import Source, SourceSpec, open_source
 from hat_ros.types import Frame, TrackState
 
+OBSERVATIONS_FILE = "observations.npz"
 # Overlay frames shown in the report.
 STRIP_FRAMES = 12
 _STRIP_WIDTH_PX = 640
@@ -42,6 +44,9 @@ def complete_folder(folder: Path, source: Source | None, measured: dict[str, Any
     log = read_result_bag(folder / BAG_FOLDER)
     figures = score_run(log, source.target if source else None) | measured
     write_tables(folder, log)
+    run = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+    if run.get("mode") == "observe":
+        save_observations(folder / OBSERVATIONS_FILE, log)
     write_json(folder / METRICS_FILE, figures)
     strip = paint_overlay(folder, source, log, video) if source and (video or report) else []
     if report:

@@ -6,6 +6,7 @@ The observations are a result bag of ``--mode observe``: candidates at every fra
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -15,9 +16,13 @@ from hat_ros.config import HatConfig
 from hat_ros.core.fusion import FusionStage
 from hat_ros.core.keyframes import KeyframeSchedule
 from hat_ros.core.offline import solve_offline
-from hat_ros.core.selector import SelectorStage
+from hat_ros.core.selector import SelectorStage, box_area_px
 from hat_ros.evaluation.runlog import RunLog, RunLogBuilder
+from hat_ros.temporal import Observations
 from hat_ros.types import Camera, Candidates, Estimate, Frame, Motion, Selection, TrackState
+
+_HALF_TURN = np.diag([1.0, -1.0, -1.0])
+_HOPELESS = 1e6
 
 
 class Selector(Protocol):
@@ -83,6 +88,37 @@ def replay_offline(log: RunLog, config: HatConfig) -> RunLog:
         )
         builder.add(candidates[i], motions[i], estimate)
     return _beside_truth(builder, log)
+
+
+def observations_of(log: RunLog) -> Observations:
+    """The same observations in the form that ``hat temporal`` reads.
+
+    That form has one SLAM gauge and the same K everywhere. So only the longest SLAM epoch keeps its motion, and
+    frames with fewer candidates are filled up with ones that can neither win nor support another: turned away from
+    the best one by 180 degrees, with a score far below all others.
+    """
+    k = max((len(group) for group in log.candidates), default=1) or 1
+    poses = np.tile(np.eye(4), (len(log), k, 1, 1))
+    scores = np.zeros((len(log), k))
+    area_px = np.full(len(log), np.nan)
+    for i, group in enumerate(log.candidates):
+        if len(group):
+            area_px[i] = box_area_px(group.box_xyxy)
+            poses[i] = group.T_cam_target[0] @ lie.transform(_HALF_TURN, np.zeros(3))
+            scores[i] = group.log_score.min() - _HOPELESS
+            poses[i, : len(group)], scores[i, : len(group)] = group.T_cam_target, group.log_score
+    epochs, counts = np.unique(log.slam_epoch[log.motion_valid], return_counts=True)
+    longest = epochs[np.argmax(counts)] if len(epochs) else -1
+    usable = log.motion_valid & (log.slam_epoch == longest)
+    slam = np.full((len(log), 4, 4), np.nan)
+    slam[usable] = lie.matrix_from_row(log.motion_rows[usable])
+    return Observations(slam, np.array([len(group) > 0 for group in log.candidates]), poses, scores, area_px)
+
+
+def save_observations(path: Path, log: RunLog) -> None:
+    """Write :func:`observations_of` as the ``.npz`` that ``hat temporal`` reads."""
+    with path.open("wb") as file:
+        np.savez_compressed(file, **vars(observations_of(log)))
 
 
 def _beside_truth(builder: RunLogBuilder, log: RunLog) -> RunLog:

@@ -12,9 +12,15 @@ from hat_ros.errors import ConfigError, UsageError
 from hat_ros.evaluation import ablate
 from hat_ros.evaluation.filters import FilterNoise, ParticleSelector, UkfSelector
 from hat_ros.evaluation.runlog import RunLogBuilder
-from hat_ros.evaluation.temporal_replay import keyframes_of, replay_offline, replay_temporal
+from hat_ros.evaluation.temporal_replay import (
+    keyframes_of,
+    observations_of,
+    replay_offline,
+    replay_temporal,
+    save_observations,
+)
 from hat_ros.source import SourceSpec
-from hat_ros.temporal import Observations, run_temporal
+from hat_ros.temporal import load_observations, run_temporal
 from hat_ros.types import Candidates, Estimate, Motion, TrackState
 
 N = 80
@@ -64,18 +70,36 @@ def test_keyframes_follow_gap_and_k():
 
 def test_replay_is_hat_temporal_on_the_same_observations():
     log = observations(flip_every=3)
-    groups = keyframes_of(log, CONFIG)
-    recorded = Observations(
-        slam=lie.matrix_from_row(log.motion_rows),
-        key=np.array([len(group) > 0 for group in groups]),
-        poses=np.array([group.T_cam_target for group in log.candidates]),
-        scores=np.array([group.log_score for group in log.candidates]),
-        box_area_px=np.full(N, 1e4),
-    )
+    due = np.array([len(group) > 0 for group in keyframes_of(log, CONFIG)])
+    recorded = replace(observations_of(log), key=due)
     expected = run_temporal(recorded, CONFIG)
     replayed = replay_temporal(log, CONFIG)
     np.testing.assert_allclose(replayed.T_est, expected.T_cam_target, atol=1e-9)
     np.testing.assert_array_equal(replayed.anchor, expected.chosen)
+
+
+def test_exported_observations_read_back_and_padding_never_wins(tmp_path):
+    log = observations(flip_every=3)
+    few = tuple(
+        Candidates(group.pose_rows[: 1 + i % 2], group.log_score[: 1 + i % 2], group.box_xyxy)
+        for i, group in enumerate(log.candidates)
+    )
+    log = replace(log, candidates=few, keyframe=np.ones(N, bool))
+    save_observations(tmp_path / "o.npz", log)
+    recorded = load_observations(tmp_path / "o.npz")
+    assert recorded.poses.shape == (N, 2, 4, 4)
+    result = run_temporal(recorded, replace(CONFIG, selector=replace(CONFIG.selector, running_gate=True)))
+    assert set(result.chosen[::2]) == {0}, "frames with one candidate choose that one"
+    expected = replay_temporal(log, replace(CONFIG, keyframes=KeyframeConfig(gap_frames=1)))
+    np.testing.assert_array_equal(run_temporal(recorded, CONFIG).chosen, expected.anchor)
+
+
+def test_exported_motion_is_that_of_the_longest_epoch():
+    log = observations()
+    epoch = np.where(np.arange(N) < 20, 0, 1)
+    slam = observations_of(replace(log, slam_epoch=epoch)).slam
+    assert np.isnan(slam[:20]).all()
+    assert np.isfinite(slam[20:]).all()
 
 
 def test_every_frame_after_the_first_anchor_has_a_pose():
