@@ -40,11 +40,17 @@ _SAME = 0.95  # overlap of two masks that are the same
 # hundredth short of that costs a hundredth of shape overlap; ...
 _MIN_FOUND = 0.6
 _MAX_STILL = 0.25
+_FOUND_BONUS = 0.1
 _MOTION_RELIEF = 0.1  # ... a mask that motion could have spoken against needs less, ...
 _CUT_SURCHARGE = 0.1  # ... one that the border cuts needs more, since part of a silhouette fits many things.
 _BENEFIT_OF_DOUBT = 0.1  # less plausibility keeps a mask than finds one
 _CLEARLY_BETTER = 0.025  # plausibility by which one explanation must beat the simpler one
-_SECOND_REGION_SHARE = 0.2  # a second bright region this large makes the choice between them a question
+# A second bright region with this share of the largest makes the choice a question; less where the border cuts the
+# largest, which may then be a planet.
+_RIVAL_SHARE = 0.2
+_RIVAL_SHARE_CUT = 0.03
+_MIN_LIT_SHAPE = 0.5  # shape overlap of the lit part of a target
+_MAX_CONTACT = 0.4  # share of its outline that the image border may cut off a target
 _SCATTERED_GAIN = 0.1  # shape overlap that bridging the gaps between lit parts must bring
 _MAX_RETRY_FRAMES = 8
 _CHECK_UNAIDED_FRAMES = 3  # between checks of a mask that no prior holds in place; more while they find the same
@@ -143,11 +149,13 @@ class ClassicalSegmenter:
         regions = sky.lit_regions(measured)
         if not regions:
             return None
-        sizes = np.array([np.count_nonzero(r) for r in regions])
-        main = 0
+        sizes = [np.count_nonzero(r) for r in regions]
+        main: int | None = 0
         silhouette = self._silhouette(frame, prior)
-        if (len(regions) > 1 and sizes[1] >= _SECOND_REGION_SHARE * sizes[0]) or sky.touches_border(regions[0]):
-            main = self._choose_region(regions, sizes, silhouette)
+        cut = sky.touches_border(regions[0])
+        rivals = [i for i, size in enumerate(sizes) if size >= (_RIVAL_SHARE_CUT if cut else _RIVAL_SHARE) * sizes[0]]
+        if cut or len(rivals) > 1:
+            main = self._choose_region(regions, rivals, silhouette)
             if main is None:
                 return self._before_texture(frame, prior)
         lit = sky.join_parts(regions, main)
@@ -169,19 +177,25 @@ class ClassicalSegmenter:
         large = cv2.resize(options[best].astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR)
         return lit | (large > 127).astype(np.uint8)
 
-    def _choose_region(self, regions: list[Mask], sizes: NDArray[np.int64], silhouette: Mask | None) -> int | None:
-        """Which bright region is the target: the one that is where it was, or else the one with its shape."""
+    def _choose_region(self, regions: list[Mask], rivals: list[int], silhouette: Mask | None) -> int | None:
+        """Which bright region is the target: the one that is where it was, or else the one with its shape.
+
+        A planet, too, is a bright region, always cut by the image border; so one that the border does not cut is
+        preferred, and a cut one must not be mostly border. None when no region will do.
+        """
         for known in (self._mask, silhouette):
             if known is not None:
-                shared = np.array([np.count_nonzero(r & known) for r in regions])
-                if shared.max() >= 0.5 * sizes[np.argmax(shared)]:
-                    return int(np.argmax(shared))
-        large = [r for r, size in zip(regions, sizes, strict=True) if size >= _SECOND_REGION_SHARE * sizes[0]]
-        shape = [self._bank.overlap(_shrink(r, self._config.cold_side_px).astype(bool)) for r in large]
-        best = int(np.argmax(shape))
-        if sky.touches_border(regions[best]) and shape[best] < self._config.min_shape_overlap:
-            return None
-        return best
+                shared = [_overlap(regions[i], known) for i in rivals]
+                if max(shared) >= 0.5:
+                    return rivals[int(np.argmax(shared))]
+        shape = {i: self._bank.overlap(_shrink(regions[i], self._config.cold_side_px).astype(bool)) for i in rivals}
+        whole = [i for i in rivals if not sky.touches_border(regions[i])]
+        best = max(whole, key=lambda i: shape[i], default=None)
+        if best is not None and (shape[best] >= _MIN_LIT_SHAPE or len(whole) == len(rivals)):
+            return best
+        required = self._config.min_shape_overlap + _CUT_SURCHARGE
+        cut = [i for i in rivals if shape[i] >= required and region.border_contact(regions[i]) <= _MAX_CONTACT]
+        return max((i for i in cut if i not in whole), key=lambda i: shape[i], default=best)
 
     # Anything else ---------------------------------------------------------------------------------------------
 
@@ -286,7 +300,8 @@ class ClassicalSegmenter:
         the doubt that motion raises: where something moves it is not, or what it holds moves with the background."""
         doubt = 0.0
         if motion is not None:
-            doubt += max(0.0, _MIN_FOUND - motion.found_share(mask))
+            found = motion.found_share(mask)
+            doubt += max(0.0, _MIN_FOUND - found) + _FOUND_BONUS * (1.0 - found)
             doubt += max(0.0, motion.still_share(mask) - _MAX_STILL)
         return self._bank.overlap(mask.astype(bool)) - doubt
 
@@ -305,6 +320,8 @@ class ClassicalSegmenter:
         if motion is not None:
             cuts.append(region.cut_from_motion(whole.rgb, motion.moving))
         cuts += [region.cut_from_nothing(whole.rgb, (side,)) for side in open_sides]
+        # Without motion an open side may let the background in: the first, closed cut is the safest.
+        margin = _CLEARLY_BETTER if motion is None else 0.0
         best, best_score = None, -np.inf
         for cut in cuts:
             if cut is None:
@@ -313,7 +330,7 @@ class ClassicalSegmenter:
             if contrast < max(_MIN_CONTRAST, chance):
                 continue
             score = self._plausibility(cut, motion)
-            if score >= max(self._required(cut, motion), best_score + _CLEARLY_BETTER):
+            if score >= max(self._required(cut, motion), best_score + margin):
                 best, best_score = cut, score
         if best is None:
             return None

@@ -102,6 +102,13 @@ def cut_from_motion(rgb: NDArray[np.uint8], moving: Mask) -> Mask | None:
     return None if cut is None else tidy(cut, moving)
 
 
+def border_contact(mask: Mask) -> float:
+    """Share of a 0/1 mask's outline that is the image border, 0 to 1."""
+    at_border = sum(int(np.count_nonzero(side)) for side in (mask[0], mask[-1], mask[:, 0], mask[:, -1]))
+    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    return at_border / max(1, sum(len(contour) for contour in contours))
+
+
 def tidy(mask: Mask, anchor: Mask | None) -> Mask | None:
     """The largest piece (or those that touch the anchor) without holes; None when nothing is left."""
     count, label, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
