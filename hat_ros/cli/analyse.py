@@ -211,7 +211,7 @@ def _add_ablate(commands: Commands) -> None:
         help="component table, sensitivity sweeps, filters, offline reference",
         description="Run the front ends once per clip, then Stages 3 and 4 over what they saw under every setting of "
         "the paper's ablations. --config decides the temporal settings; --front-end, if given, takes segmentation, "
-        "hypotheses and motion (and the scale of the appearance score) from another preset.",
+        "hypotheses and motion (and what belongs to its scores) from another preset.",
     )
     _add_campaign(parser)
     parser.add_argument("--front-end", metavar="NAME|FILE", help="preset of the front ends (default: that of --config)")

@@ -86,13 +86,14 @@ def plan(
     overrides: Sequence[str] = (),
     limit: int | None = None,
 ) -> Plan:
-    """Merge the configurations, write the result to ``out/config.yaml``, and list the runs.
+    """Merge the configurations, write the result to ``out/config.yaml``, and list the runs of the front ends.
 
     Args:
         clips: recordings with truth.
         out: campaign folder.
         config: preset or file of the temporal settings.
-        front_end: preset or file of segmentation, hypotheses and motion; None = that of ``config``.
+        front_end: preset or file of segmentation, hypotheses and motion, and of what belongs to its scores
+            (``score_scale``, ``running_gate``); None = that of ``config``.
         overrides: ``key=value`` settings on top of both.
         limit: at most this many frames per clip.
 
@@ -111,20 +112,36 @@ def plan(
             slam=front.slam,
             nets=front.nets,
             refinement=front.refinement,
-            selector=replace(merged.selector, score_scale=front.selector.score_scale),
+            # How scores are scaled and whether candidates of one frame support each other is the estimator's nature.
+            selector=replace(
+                merged.selector, score_scale=front.selector.score_scale, running_gate=front.selector.running_gate
+            ),
         )
     if len({spec.name for spec in clips}) < len(clips):
         raise UsageError("two recordings have the same name: rename one of them")
     try:
         out.mkdir(parents=True, exist_ok=True)
         write_config(out, merged)
+        # Without the temporal settings, so that runs of the front ends are used again when only those change.
+        (out / "front_end").mkdir(exist_ok=True)
+        write_config(
+            out / "front_end",
+            HatConfig(
+                segmentation=merged.segmentation,
+                hypotheses=merged.hypotheses,
+                slam=merged.slam,
+                nets=merged.nets,
+                refinement=merged.refinement,
+            ),
+        )
     except OSError as error:
         raise RunError(f"cannot write {out}: {error.strerror}") from None
     jobs = []
     for spec in clips:
         for kind, mode, settings in _RUNS:
             labels = {"clip": spec.name, "kind": kind}
-            jobs.append(Job(f"{spec.name}-{kind}", spec, mode, str(out / CONFIG_FILE), settings, 0, limit, labels))
+            config_file = str(out / "front_end" / CONFIG_FILE)
+            jobs.append(Job(f"{spec.name}-{kind}", spec, mode, config_file, settings, 0, limit, labels))
     return Plan(merged, jobs)
 
 

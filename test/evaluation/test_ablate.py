@@ -188,6 +188,10 @@ def test_plan_merges_presets_and_refuses_bad_ones(tmp_path):
     assert plan.config.fusion.gate_angle_deg == 75.0
     assert (plan.config.hypotheses.max_candidates, plan.config.selector.score_scale) == (5, 0.5)
     assert {job.mode for job in plan.jobs} == {"observe", "tracking"}
+    before = [job.fingerprint() for job in plan.jobs]
+    temporal.write_text("fusion: {gate_angle_deg: 30.0}\nkeyframes: {gap_frames: 20}\n")
+    again = ablate.plan([SourceSpec(clip)], tmp_path / "out", str(temporal), str(front))
+    assert [job.fingerprint() for job in again.jobs] == before, "front ends run again only if they changed"
     with pytest.raises(ConfigError, match="fusion"):
         ablate.plan([SourceSpec(clip)], tmp_path / "out", str(temporal), overrides=["fusion.nope=1"])
     with pytest.raises(UsageError, match="same name"):
