@@ -36,7 +36,7 @@ _NEIGHBOUR_SOFTENING_PX = 5.0
 _CAMERA_AGILITY = 30.0
 # Rival solutions are tried every so many frames: the mirror image, and the CAD's when it disagrees this much.
 _RIVAL_PERIOD = 5
-_MIN_SURFACE_AGREEMENT = 0.7
+_MIN_PRIOR_AGREEMENT = 0.7
 
 
 class FeatureSlam:
@@ -95,7 +95,7 @@ class FeatureSlam:
         self._surface: SurfacePrior | None = None
         self._n_wrong = np.zeros(self._config.max_points, dtype=np.int64)
         self._n_lost = 0
-        self._met_surface = False
+        self._met_prior = False
 
     def _start(self, stamp_ns: int, image: Image, region: Image) -> Motion:
         """First frame of an epoch: defines the gauge, if it shows enough points."""
@@ -146,16 +146,21 @@ class FeatureSlam:
         return True
 
     def _try_rivals(self) -> None:
+        """Now and then ask whether another solution, or another opinion of the prior, explains the tracks better."""
         window = self._window
-        phase = window.number[-1] % _RIVAL_PERIOD
+        prior_known = np.count_nonzero(window.n_looks) >= _MIN_POINTS
+        if prior_known and not self._met_prior:
+            self._met_prior = True
+            window.try_prior()
+            return
+        turn, phase = divmod(window.number[-1], _RIVAL_PERIOD)
         if phase == 0 and len(window) > 3:
-            window.try_mirror()
-        agreement = window.surface_agreement()
-        if not self._met_surface and (window.n_surface > 0).sum() >= _MIN_POINTS:
-            self._met_surface = True
-            window.try_expected()
-        elif phase == 2 and agreement < _MIN_SURFACE_AGREEMENT:
-            window.try_expected()
+            if window.trusts_prior and turn % 2 == 0:
+                window.challenge_prior()
+            else:
+                window.challenge_structure()
+        elif phase == 2 and prior_known and window.prior_agreement() < _MIN_PRIOR_AGREEMENT:
+            window.try_prior()
 
     def _guess(self, stamp_ns: int) -> Float:
         """(N, 2) expected pixel positions: where the points are now plus their predicted displacement."""

@@ -106,30 +106,32 @@ class SurfacePrior:
             k = window.stamps_ns.index(past.stamp_ns)
             R, t = window.R[k], window.t[k]
         scale = float(np.median(window.points_in_camera(R, t)[slots, 2] / z_m))
-        first = self._units_per_m is None
-        self._units_per_m = scale if first else self._units_per_m
+        if self._units_per_m is None or not window.trusts_prior:
+            self._units_per_m = scale
+            # Poses of an untrusting window may contradict the surface: one look alone is consistent with itself.
+            window.n_looks[:] = 0
         scale *= (self._units_per_m / scale) ** _SCALE_PULL
         rays = np.concatenate([past.xn[slots], np.ones((len(slots), 1))], axis=1)
         points = (rays * (scale * z_m)[:, None] - t) @ R
-        new = window.n_surface[slots] == 0
-        window.n_surface[slots] += 1
-        share = np.where(new, 1.0, 1.0 / np.minimum(window.n_surface[slots], _MEAN_OF_LOOKS))[:, None]
-        window.X_expected[slots] += share * (points - window.X_expected[slots])
-        window.X_info[slots] = (scale * sigma_m) ** -2
-        if not first:
+        new = window.n_looks[slots] == 0
+        window.n_looks[slots] += 1
+        share = (1.0 / np.minimum(window.n_looks[slots], _MEAN_OF_LOOKS))[:, None]
+        window.X_surface[slots] += share * (points - window.X_surface[slots])
+        window.surface_info[slots] = (scale * sigma_m) ** -2
+        if window.trusts_prior:
             fresh = new & (np.count_nonzero(window.seen[:, slots], axis=0) < _FRESH_OBSERVATIONS)
             window.X[slots[fresh]] = points[fresh]
 
     def _expect_rotations(self, window: Window) -> None:
         """Fused rotations of window frames, up to the common turn that brings them nearest to the window's."""
-        window.R_info[:] = 0.0
+        window.fused_info[:] = 0.0
         frames = [k for k, stamp in enumerate(window.stamps_ns) if stamp in self._rotation]
         if len(frames) < _MIN_ROTATIONS:
             return
         R_cam_target = np.stack([self._rotation[window.stamps_ns[k]] for k in frames])
         R_target_slam = robust_mean_rotation(np.swapaxes(R_cam_target, 1, 2) @ window.R[frames])
-        window.R_expected[frames] = R_cam_target @ R_target_slam
-        window.R_info[frames] = np.radians(self._config.prior_turn_sigma_deg) ** -2
+        window.R_fused[frames] = R_cam_target @ R_target_slam
+        window.fused_info[frames] = np.radians(self._config.prior_turn_sigma_deg) ** -2
 
 
 def robust_mean_rotation(R: Float) -> Float:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hat_ros import lie
 from hat_ros.config import FeatureSlamConfig
-from hat_ros.slam.bundle import Problem, adjust_window, refine_pose, turn_between
+from hat_ros.slam.bundle import Problem, adjust_window, refine_pose, turn_between, window_cost
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -31,9 +31,14 @@ _PREDICTION_SLACK = 3.0
 _FIRST_TURN_RAD, _FIRST_MOVE_RADII = 0.35, 1.0
 # The structure of an epoch younger than this is a guess, so its tracks cannot be told from outliers yet.
 _YOUNG_FRAMES = 10
+_YOUNG_CUTOFFS = (8.0, 4.0, 2.0)
 # A rival solution must be this much cheaper, relative and absolute, to take over.
 _RIVAL_SHARE, _RIVAL_MARGIN = 0.9, 20.0
 _RIVAL_ITERATIONS = 8
+# A prior is dropped when the cost without it is lower by this much per observation and is this share of the cost with
+# it; it comes back when it costs less than this more. Right priors of 3 degrees noise stay at half the gain.
+_DISTRUST_GAIN, _DISTRUST_SHARE = 0.04, 0.7
+_TRUST_LOSS, _TRUST_SHARE = 0.03, 0.9
 _MIRROR = np.diag([1.0, 1.0, -1.0])
 
 
@@ -52,9 +57,10 @@ class Window:
         stamps_ns, number: of the W frames, oldest first; ``number`` counts frames of the epoch.
         R, t: (W, 3, 3), (W, 3) poses ``p_cam = R p_slam + t``.
         xn, seen: (W, N, 2), (W, N) normalised observations and which of them exist.
-        X: (N, 3) points. X_expected, X_info: where they are expected and how firmly (1/unit^2).
-        n_surface: (N,) how often the CAD surface was seen at the point; 0 = expected from its neighbours only.
-        R_expected, R_info: (W, 3, 3), (W,) rotations that fused poses suggest.
+        X: (N, 3) points. X_guess, guess_info: where their neighbours put them, and how firmly (1/unit^2).
+        X_surface, surface_info: (N, 3), (N,) where the CAD surface puts them after n_looks (N,) looks.
+        R_fused, fused_info: (W, 3, 3), (W,) rotations that fused poses suggest.
+        trusts_prior: whether the adjustment uses the CAD surface and fused rotations.
         cost: of the last adjustment; covariance: (12, 12) of the last two poses.
     """
 
@@ -78,11 +84,14 @@ class Window:
         self.xn = np.zeros((1, n, 2))
         self.seen = np.zeros((1, n), dtype=bool)
         self.X = np.zeros((n, 3))
-        self.X_expected = np.zeros((n, 3))
-        self.X_info = np.zeros(n)
-        self.n_surface = np.zeros(n, dtype=np.int64)
-        self.R_expected = np.eye(3)[None].copy()
-        self.R_info = np.zeros(1)
+        self.X_guess = np.zeros((n, 3))
+        self.guess_info = np.zeros(n)
+        self.X_surface = np.zeros((n, 3))
+        self.surface_info = np.zeros(n)
+        self.n_looks = np.zeros(n, dtype=np.int64)
+        self.R_fused = np.eye(3)[None].copy()
+        self.fused_info = np.zeros(1)
+        self.trusts_prior = False
         # Standard deviations of the accelerations, rad/s^2 and units/s^2.
         self._acceleration = agility * np.array(
             [np.radians(config.turn_acceleration_deg_s2), config.move_acceleration_radii_s2 * radius]
@@ -131,15 +140,15 @@ class Window:
         self.number.append(self.number[-1] + 1)
         self.R, self.t = np.concatenate([self.R, R[None]]), np.concatenate([self.t, t[None]])
         self.xn, self.seen = np.concatenate([self.xn, xn[None]]), np.concatenate([self.seen, seen[None]])
-        self.R_expected = np.concatenate([self.R_expected, R[None]])
-        self.R_info = np.append(self.R_info, 0.0)
+        self.R_fused = np.concatenate([self.R_fused, R[None]])
+        self.fused_info = np.append(self.fused_info, 0.0)
 
     def place(self, slots: NDArray[np.int64], xn: Float, z: Float, sigma: float) -> None:
         """New points in slots, seen by the newest frame at (n, 2) with expected depth (n,) +- sigma."""
         in_camera = np.concatenate([xn, np.ones((len(xn), 1))], axis=1) * z[:, None]
-        self.X[slots] = self.X_expected[slots] = (in_camera - self.t[-1]) @ self.R[-1]
-        self.X_info[slots] = sigma**-2
-        self.n_surface[slots] = 0
+        self.X[slots] = self.X_guess[slots] = (in_camera - self.t[-1]) @ self.R[-1]
+        self.guess_info[slots] = sigma**-2
+        self.n_looks[slots] = 0
         self.seen[:, slots] = False
         self.seen[-1, slots] = True
         self.xn[-1, slots] = xn
@@ -161,41 +170,51 @@ class Window:
 
     def _remove(self, k: int) -> None:
         del self.stamps_ns[k], self.number[k]
-        for name in ("R", "t", "xn", "seen", "R_expected", "R_info"):
+        for name in ("R", "t", "xn", "seen", "R_fused", "fused_info"):
             setattr(self, name, np.delete(getattr(self, name), k, axis=0))
 
     def adjust(self) -> None:
         """Bundle-adjust the window; while it is young, from a wide loss to a narrow one."""
-        self.cost, self.covariance = self._descend(self.R, self.t, self.X, self._problem(), self._config.iterations)
+        state, problem = (self.R, self.t, self.X), self._problem(self.trusts_prior)
+        self.cost, self.covariance = self._descend(state, problem, self._config.iterations)
 
-    def _descend(self, R: Float, t: Float, X: Float, problem: Problem, n_iterations: int) -> tuple[float, Float]:
-        if self.number[-1] <= _YOUNG_FRAMES:
-            for factor in (8.0, 4.0, 2.0):
-                adjust_window(R, t, X, problem._replace(cutoff_px=factor * problem.cutoff_px), n_iterations)
-        return adjust_window(R, t, X, problem, n_iterations)
-
-    def try_mirror(self) -> bool:
-        """Whether the depth-reversed solution fits better; if so it takes over.
+    def challenge_structure(self) -> None:
+        """Let the depth-reversed solution take over if it explains the tracks better.
 
         Seen from afar, a relief turning one way and its mirror image turning the other way look the same (Necker
         reversal); only perspective and expected points tell them apart, and the descent cannot cross over.
         """
         k = len(self) // 2
-        seen = self.seen.any(axis=0)
         in_camera = self.points_in_camera(self.R[k], self.t[k])
-        center = np.median(in_camera[seen], axis=0)
+        center = np.median(in_camera[self.seen.any(axis=0)], axis=0)
         X = ((in_camera - center) @ _MIRROR + center - self.t[k]) @ self.R[k]
-        center_slam = (center - self.t[k]) @ self.R[k]
-        R = _MIRROR @ (self.R @ self.R[k].T) @ _MIRROR @ self.R[k]
-        t = self.t + (self.R - R) @ center_slam
-        # What neighbours suggested was a guess in the spirit of the solution it came from: it turns with it.
-        guessed = (self.n_surface == 0)[:, None]
-        return self._try(R, t, X, np.where(guessed, X, self.X_expected))
+        R = np.ascontiguousarray(_MIRROR @ (self.R @ self.R[k].T) @ _MIRROR @ self.R[k])
+        t = self.t + (self.R - R) @ ((center - self.t[k]) @ self.R[k])
+        # Guesses were made in the spirit of the solution: they turn with it.
+        problem = self._problem(False)._replace(X_expected=X.copy())
+        cost, _ = self._descend((R, t, X), problem, _RIVAL_ITERATIONS)
+        if self.trusts_prior:
+            self._distrust_for((R, t, X), cost)
+        elif cost < _RIVAL_SHARE * self.cost - _RIVAL_MARGIN:
+            self.R, self.t, self.X, self.X_guess = R, t, X, X.copy()
 
-    def try_expected(self) -> bool:
-        """Whether the structure that the CAD surface suggests fits better; if so it takes over."""
-        known = self.n_surface > 0
-        X = np.where(known[:, None], self.X_expected, self.X)
+    def challenge_prior(self) -> None:
+        """Stop trusting the prior if the tracks are explained much better without it."""
+        state = self.R.copy(), self.t.copy(), self.X.copy()
+        cost, _ = self._descend(state, self._problem(False), _RIVAL_ITERATIONS)
+        self._distrust_for(state, cost)
+
+    def _distrust_for(self, state: tuple[Float, Float, Float], cost: float) -> None:
+        present = window_cost(self.R, self.t, self.X, self._problem(False))
+        if present - cost > _DISTRUST_GAIN * np.count_nonzero(self.seen) and cost < _DISTRUST_SHARE * present:
+            self.R, self.t, self.X = state
+            self.X_guess = self.X.copy()
+            self.trusts_prior = False
+
+    def try_prior(self) -> None:
+        """Take the structure that the prior suggests, and trust it, if it explains the tracks about as well."""
+        known = self.n_looks > 0
+        X = np.where(known[:, None], self.X_surface, self.X)
         R, t = self.R.copy(), self.t.copy()
         for k in range(len(self)):
             use = self.seen[k] & known
@@ -204,24 +223,22 @@ class Window:
                     R[k], t[k], X, self.xn[k], use, self.focal, self._config.sigma_px, _WIDE_CUTOFF_PX, R[k], t[k],
                     1.0, 1.0, 8,
                 )  # fmt: skip
-        return self._try(R, t, X, self.X_expected)
+        self._descend((R, t, X), self._problem(True), _RIVAL_ITERATIONS)
+        free = self._problem(False)
+        present = window_cost(self.R, self.t, self.X, free)
+        allowed = max(present / _TRUST_SHARE, present + _TRUST_LOSS * np.count_nonzero(self.seen))
+        if window_cost(R, t, X, free) < allowed:
+            self.R, self.t, self.X = R, t, X
+            self.trusts_prior = True
 
-    def _try(self, R: Float, t: Float, X: Float, X_expected: Float) -> bool:
-        R, t = np.ascontiguousarray(R), np.ascontiguousarray(t)
-        problem = self._problem()._replace(X_expected=X_expected)
-        cost, covariance = self._descend(R, t, X, problem, _RIVAL_ITERATIONS)
-        if cost > _RIVAL_SHARE * self.cost - _RIVAL_MARGIN:
-            return False
-        self.R, self.t, self.X, self.X_expected = R, t, X, X_expected
-        self.cost, self.covariance = cost, covariance
-        return True
-
-    def surface_agreement(self) -> float:
-        """Share of the points in use whose position the CAD surface confirms (two sigmas); 1 when it knows too few."""
-        known = self.seen.any(axis=0) & (self.n_surface > 0)
+    def prior_agreement(self) -> float:
+        """Share of the points in use that lie where the prior expects them (two sigmas); 0 while it is not trusted."""
+        if not self.trusts_prior:
+            return 0.0
+        known = self.seen.any(axis=0) & (self.n_looks > 0)
         if np.count_nonzero(known) < _MIN_SHARED_POINTS:
             return 1.0
-        offset = np.linalg.norm(self.X[known] - self.X_expected[known], axis=1) * np.sqrt(self.X_info[known])
+        offset = np.linalg.norm(self.X[known] - self.X_surface[known], axis=1) * np.sqrt(self.surface_info[known])
         return float(np.mean(offset < 2.0))
 
     def step_sigma_rad(self) -> float:
@@ -231,13 +248,33 @@ class Window:
         J[:, :3], J[:, 6:9] = -A, np.eye(3)
         return float(np.sqrt(np.trace(J @ self.covariance @ J.T)))
 
-    def _problem(self) -> Problem:
+    def _descend(self, state: tuple[Float, Float, Float], problem: Problem, n_iterations: int) -> tuple[float, Float]:
+        R, t, X = state
+        if self.number[-1] <= _YOUNG_FRAMES:
+            for factor in _YOUNG_CUTOFFS:
+                adjust_window(R, t, X, problem._replace(cutoff_px=factor * problem.cutoff_px), n_iterations)
+        return adjust_window(R, t, X, problem, n_iterations)
+
+    def _problem(self, with_prior: bool) -> Problem:
         seconds = (np.array(self.stamps_ns, dtype=np.int64) - self.stamps_ns[0]) * 1e-9
         dt = np.diff(seconds, prepend=-1.0)
         rate_info = np.zeros((len(self), 2))
         span = 0.5 * (dt[1:-1] + dt[2:])
         rate_info[1:-1] = (self._acceleration * span[:, None]) ** -2
+        known = (self.n_looks > 0) & with_prior
         return Problem(
-            self.xn, self.seen, self.focal, self._config.sigma_px, self._config.cutoff_px, self.X_expected, self.X_info,
-            self.R_expected, self.R_info, dt, rate_info, self.R[0].copy(), self.t[0].copy(), _GAUGE_INFO,
-        )  # fmt: skip
+            xn=self.xn,
+            seen=self.seen,
+            focal=self.focal,
+            sigma_px=self._config.sigma_px,
+            cutoff_px=self._config.cutoff_px,
+            X_expected=np.where(known[:, None], self.X_surface, self.X_guess),
+            X_info=np.where(known, self.surface_info, self.guess_info),
+            R_expected=self.R_fused,
+            R_info=self.fused_info * with_prior,
+            dt=dt,
+            rate_info=rate_info,
+            R_gauge=self.R[0].copy(),
+            t_gauge=self.t[0].copy(),
+            gauge_info=_GAUGE_INFO,
+        )
