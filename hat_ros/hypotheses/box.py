@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hat_ros.segmentation.boundary import refine_outline
-from hat_ros.segmentation.region import cut_from_nothing
+from hat_ros.segmentation.region import ColorModels, graph_cut, tidy
 
 # Surroundings kept around the box as the example of background, as a share of its longer side.
 _SURROUNDINGS = 0.15
@@ -17,6 +17,7 @@ _MIN_RANGE = 24
 _OUTLINE_BAND_PX = 3
 _OUTLINE_CONTRAST = 10.0
 _MIN_AREA_PX = 30
+_ITERATIONS = 3
 
 
 def silhouette_in_box(rgb: NDArray[np.uint8], box_mask: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
@@ -36,10 +37,10 @@ def silhouette_in_box(rgb: NDArray[np.uint8], box_mask: NDArray[np.bool_]) -> ND
         return None
     scale = min(1.0, _WORK_SIDE_PX / max(crop.shape[:2]))
     size = (max(8, round(crop.shape[1] * scale)), max(8, round(crop.shape[0] * scale)))
-    reaches = {"top": y0 == rows[0], "bottom": y1 == rows[-1] + 1, "left": x0 == cols[0], "right": x1 == cols[-1] + 1}
-    cut = cut_from_nothing(
-        cv2.resize(crop, size, interpolation=cv2.INTER_AREA), tuple(s for s in reaches if reaches[s])
-    )
+    inside = cv2.resize(box_mask[y0:y1, x0:x1].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    labels = np.where(inside > 0, cv2.GC_PR_FGD, cv2.GC_BGD).astype(np.uint8)
+    cut = graph_cut(cv2.resize(crop, size, interpolation=cv2.INTER_AREA), labels, ColorModels(), _ITERATIONS)
+    cut = None if cut is None else tidy(cut, None)
     if cut is None:
         return None
     mask = np.zeros((height, width), np.uint8)

@@ -22,6 +22,11 @@ from hat_ros.types import Camera
 # detector's reach is missing from the mask; mask where there is no target is rarer.
 MISSING_WEIGHT = 0.5
 
+# Where the centroid of a cut silhouette may lie, in radii of gyration of what is seen, and its size relative to it.
+_CUT_ASSUMPTIONS = tuple(
+    (shift, scale) for shift in (0.0, 0.4, 0.9, 1.5, 2.2) for scale in (1.1, 1.4, 1.8, 2.4) if scale > 0.8 + 0.5 * shift
+)
+
 
 @dataclass(frozen=True)
 class Placement:
@@ -58,10 +63,7 @@ def cut_placements(mask: NDArray[np.bool_]) -> list[Placement]:
         outward += np.count_nonzero(pixels) * np.array(direction, dtype=np.float64)
     length = np.linalg.norm(outward)
     outward = outward / length if length > 0 else outward
-    return [
-        Placement(center + shift * gyration * outward, scale * gyration)
-        for shift, scale in ((0.0, 1.15), (0.4, 1.15), (0.4, 1.4), (0.9, 1.4), (0.9, 1.8), (1.5, 1.8), (1.5, 2.4))
-    ]
+    return [Placement(center + shift * gyration * outward, scale * gyration) for shift, scale in _CUT_ASSUMPTIONS]
 
 
 def partial_placements(mask: NDArray[np.bool_]) -> list[Placement]:

@@ -52,11 +52,11 @@ class Scorer:
         self._frame = frame
         self.field = field
         self._render_px = render_px
-        self._luma = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+        self.luma = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
 
     def mismatch(self, view: View, outline_px: float, tolerance_px: float) -> tuple[float, float, float]:
         """Excess, missing and hidden (see :class:`Evidence`) of what disagrees deeper than a tolerance."""
-        areas = self.field.compare(view, self._luma, tolerance_px)
+        areas = self.field.compare(view, self.luma, tolerance_px)
         outline = max(outline_px, 1.0)
         return areas.extra / outline, areas.missing / outline, areas.hidden / outline
 
@@ -74,7 +74,7 @@ class Scorer:
         near = length * fit.contour[:, 2]
         edge = (fit.contour[:, 4] > 0) & (np.abs(fit.contour[:, 3]) < 1.5)
         return Evidence(
-            self.field.compare(view, self._luma).union_share,
+            self.field.compare(view, self.luma).union_share,
             excess,
             missing,
             hidden,

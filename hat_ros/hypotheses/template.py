@@ -75,7 +75,9 @@ class TemplateHypotheses:
             return Candidates.none()
         field = MaskField(mask)
         scorer = Scorer(self._viewer, frame, field, self._options.render_px)
-        starts = [prior.T_cam_target] if prior is not None and prior.healthy else []
+        starts = []
+        if prior is not None and prior.healthy:
+            starts.append(self._fitter.centred(prior.T_cam_target, frame.camera, field, scorer.luma))
         poses, scores = self._align(starts + self._coarse(whole_placement(mask), frame, field), frame, scorer)
         if not poses or max(scores) < _POOR_SCORE:
             # The mask is not the whole silhouette: look for those that it may be a part of.

@@ -12,15 +12,11 @@ from hat_ros.refinement.covariance import pose_covariance
 from hat_ros.refinement.refiner import WITH_MASK, WITHOUT_MASK, PoseFitter
 from hat_ros.refinement.view import MaskField, TargetViewer
 from hat_ros.target import Target
-from hat_ros.types import Camera, Detection, Frame, Refined
+from hat_ros.types import Detection, Frame, Refined
 
 # The mask's robust scales are meant for a target of this size or more and shrink with smaller ones.
 _USUAL_SIZE_PX = 250.0
 _SCALE_LIMITS = (0.4, 1.0)
-# A silhouette that leaves out more than this share of the mask is off centre (a mask may lack dark parts of the target,
-# but little of it lies beside the target); judged on a view of this size.
-_BESIDE_SHARE = 0.15
-_CENTRING_PX = 64
 
 
 class FusedPoseRefiner:
@@ -55,7 +51,7 @@ class FusedPoseRefiner:
         if field is not None:
             factor = float(np.clip(field.size_px / _USUAL_SIZE_PX, *_SCALE_LIMITS))
             rounds = (WITH_MASK[0].scaled(factor), *WITH_MASK[1:])
-            start = self._centred(T_cam_target, frame.camera, field, luma)
+            start = self._fitter.centred(T_cam_target, frame.camera, field, luma)
         sigma = np.radians(self._config.start_sigma_deg)
         fit = self._fitter.fit(start, frame.camera, frame.rgb, field, rounds, sigma)
         if fit is None or not self._same_basin(start, fit.T_cam_target):
@@ -72,32 +68,6 @@ class FusedPoseRefiner:
 
     def reset(self) -> None:
         """Nothing to forget: every frame stands for itself."""
-
-    def _centred(
-        self, T_cam_target: NDArray[np.float64], camera: Camera, field: MaskField, luma: NDArray[np.uint8]
-    ) -> NDArray[np.float64]:
-        """The start moved sideways so that silhouette and mask share their centroid, if that covers the mask.
-
-        Rotation is predicted better than position: a target that drifts across the image leaves the capture range of
-        the outline long before it turns out of it.
-        """
-        view = self._viewer.view(T_cam_target, camera, _CENTRING_PX)
-        if view is None:
-            return T_cam_target
-        areas = field.compare(view, luma)
-        if areas.extra <= _BESIDE_SHARE * field.area_px:
-            return T_cam_target
-        pixels = np.argwhere(view.mask)[:, ::-1] / view.scale + view.origin_px
-        pixels = pixels[((pixels > -0.5) & (pixels < np.array(luma.shape[::-1]) - 0.5)).all(axis=1)]
-        if not len(pixels):
-            return T_cam_target
-        shift = np.linalg.solve(camera.K, np.append(field.centroid_px - pixels.mean(axis=0), 0.0))
-        moved = T_cam_target.copy()
-        center_z = T_cam_target[2, :3] @ self._target.center_m + T_cam_target[2, 3]
-        moved[:3, 3] += center_z * shift
-        view = self._viewer.view(moved, camera, _CENTRING_PX)
-        closer = view is not None and field.compare(view, luma).extra < 0.5 * areas.extra
-        return moved if closer else T_cam_target
 
     def _same_basin(self, T_before: NDArray[np.float64], T_after: NDArray[np.float64]) -> bool:
         turn = np.degrees(lie.angle_between(T_before[:3, :3], T_after[:3, :3]))

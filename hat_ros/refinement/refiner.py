@@ -34,6 +34,12 @@ class Schedule:
         return replace(self, mask=tuple(factor * scale for scale in self.mask))
 
 
+# A silhouette that leaves out more than this share of the mask is off centre (a mask may lack dark parts of the target,
+# but little of it lies beside the target); judged on a view of this size.
+_BESIDE_SHARE = 0.15
+_CENTRING_PX = 64
+# Where the image border cuts the target, what is seen of it changes with each move.
+_CENTRING_STEPS = 4
 # The mask leads the way, then the image's own edges take over; without a mask long lines lead the way.
 WITH_MASK = (
     Schedule((0, 0, 6, 4), (1, 1, 3, 2), (10, 6, 4, 3), damping=3e-3),
@@ -140,6 +146,35 @@ class PoseFitter:
             self.viewer.target.bounding_radius_m,
         )
         return lie.transform(R, t)
+
+    def centred(
+        self, T_cam_target: NDArray[np.float64], camera: Camera, field: MaskField, luma: NDArray[np.uint8]
+    ) -> NDArray[np.float64]:
+        """The start moved sideways so that silhouette and mask share their centroid, if that covers the mask.
+
+        Rotation is predicted better than position: a target that drifts across the image leaves the capture range of
+        the outline long before it turns out of it.
+        """
+        best, least = T_cam_target, np.inf
+        T = T_cam_target
+        for _ in range(_CENTRING_STEPS):
+            view = self.viewer.view(T, camera, _CENTRING_PX)
+            if view is None:
+                break
+            beside = field.compare(view, luma).extra
+            if beside >= least:
+                break
+            best, least = T, beside
+            if beside <= _BESIDE_SHARE * field.area_px:
+                break
+            pixels = np.argwhere(view.mask)[:, ::-1] / view.scale + view.origin_px
+            pixels = pixels[((pixels > -0.5) & (pixels < np.array(luma.shape[::-1]) - 0.5)).all(axis=1)]
+            if not len(pixels):
+                break
+            shift = np.linalg.solve(camera.K, np.append(field.centroid_px - pixels.mean(axis=0), 0.0))
+            T = T.copy()
+            T[:3, 3] += (T[2, :3] @ self.viewer.target.center_m + T[2, 3]) * shift
+        return best
 
     def iterate(
         self,

@@ -26,6 +26,8 @@ from hat_ros.types import Camera
 VISIBLE_LEVEL = 32.0
 # Margin of the rendered crop around the target, in crop pixels: the contour needs background on both sides.
 _CROP_MARGIN_PX = 4
+# What lies further outside the image than this share of its longer side is not rendered.
+_BEYOND_IMAGE = 0.05
 # The field reaches this far around the mask, pixels and share of the mask's longer side.
 _MIN_MARGIN_PX = 20
 _MARGIN_SHARE = 0.15
@@ -36,7 +38,7 @@ _DEPTH_BINS = 200
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """The silhouette on a crop that holds the whole target, at its own resolution.
+    """The silhouette on a crop that holds what the image can show of the target, at its own resolution.
 
     Attributes:
         mask: (h, w) bool silhouette.
@@ -65,12 +67,15 @@ class TargetViewer:
             self._hull_m = target.vertices_m
 
     def view(self, T_cam_target: NDArray[np.float64], camera: Camera, side_px: int) -> View | None:
-        """The target at a pose, its longer side ``side_px`` crop pixels; None when it reaches behind the camera."""
+        """The target at a pose, longer side ``side_px`` crop pixels; None when out of view or behind the camera."""
         points = self._hull_m @ T_cam_target[:3, :3].T + T_cam_target[:3, 3]
         if not np.isfinite(points).all() or points[:, 2].min() <= 1e-3 * self.target.bounding_radius_m:
             return None
         uv = camera.project(points)
-        low, high = uv.min(axis=0), uv.max(axis=0)
+        size = np.array([camera.width, camera.height])
+        beyond = _BEYOND_IMAGE * size.max()
+        low = np.clip(uv.min(axis=0), -beyond, size + beyond)
+        high = np.clip(uv.max(axis=0), -beyond, size + beyond)
         scale = (side_px - 2 * _CROP_MARGIN_PX) / max(float((high - low).max()), 1e-3)
         if not 1e-3 < scale < 1e3:
             return None
