@@ -141,9 +141,9 @@ class DroidConfig:
         choices=("auto", "float32", "float16", "bfloat16"),
     )
     correlation: str = option(
-        "stored",
-        "stored volumes, or on_the_fly: less memory, more work",
-        choices=("stored", "on_the_fly"),
+        "auto",
+        "stored volumes, on_the_fly (less memory, more work), or auto: stored while they fit in 4 GiB",
+        choices=("auto", "stored", "on_the_fly"),
     )
     warmup_keyframes: int = option(8, "keyframes of the first bundle adjustment", low=5, high=64)
     filter_threshold: float = option(2.4, "mean flow from the last keyframe that makes a new one", low=0)

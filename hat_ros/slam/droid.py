@@ -17,6 +17,7 @@ from hat_ros.config import DroidConfig, HatConfig
 from hat_ros.errors import ConfigError
 from hat_ros.nets.droid import STRIDE_PX, DroidNet
 from hat_ros.slam.droid_frontend import DroidFrontend
+from hat_ros.slam.droid_graph import MAX_FACTORS
 from hat_ros.slam.droid_keyframes import FlowModel
 from hat_ros.slam.droid_offline import finish
 from hat_ros.target import Target
@@ -25,6 +26,7 @@ from hat_ros.types import Camera, Detection, Frame, Motion, PosePrior
 _PRECISIONS = {"float32": None, "float16": torch.float16, "bfloat16": torch.bfloat16}
 # Correlation needs this many 1/8 pixels on the short side for its coarsest level to hold one.
 _MIN_SIDE = 8
+_MAX_VOLUME_BYTES = 4 * 2**30
 
 
 class DroidSlam:
@@ -90,7 +92,7 @@ class DroidSlam:
     ) -> DroidFrontend:
         shape = image.shape[2] // STRIDE_PX, image.shape[3] // STRIDE_PX
         rows = torch.tensor(intrinsics / STRIDE_PX, dtype=torch.float32, device=self._device)
-        stored = self._config.correlation == "stored"
+        stored = keep_volumes(self._config, shape, self._model.dtype)
         return DroidFrontend(self._config, self._model, rows, shape, keep_all=keep_all, stored=stored)
 
 
@@ -179,6 +181,14 @@ def choose_precision(name: str, device: torch.device) -> torch.dtype | None:
     if name == "auto":
         return torch.float16 if device.type == "cuda" else None
     return _PRECISIONS[name]
+
+
+def keep_volumes(config: DroidConfig, shape: tuple[int, int], dtype: torch.dtype) -> bool:
+    """Whether correlation volumes of (h, w) features are stored; the limit is a constant, so every machine agrees."""
+    if config.correlation != "auto":
+        return config.correlation == "stored"
+    pixels = shape[0] * shape[1]
+    return MAX_FACTORS * pixels**2 * 4 // 3 * dtype.itemsize <= _MAX_VOLUME_BYTES
 
 
 def _same_camera(a: Camera, b: Camera) -> bool:

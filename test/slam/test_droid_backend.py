@@ -12,7 +12,15 @@ from hat_ros import lie
 from hat_ros.config import DroidConfig, HatConfig, SlamConfig
 from hat_ros.errors import ConfigError, RunError, WeightsError
 from hat_ros.nets.droid import DroidNet
-from hat_ros.slam.droid import DroidSlam, choose_device, choose_precision, offline_motions, prepare, slam_rows
+from hat_ros.slam.droid import (
+    DroidSlam,
+    choose_device,
+    choose_precision,
+    keep_volumes,
+    offline_motions,
+    prepare,
+    slam_rows,
+)
 from hat_ros.stages import create_backend
 from hat_ros.types import Camera, Detection, Frame
 
@@ -108,6 +116,14 @@ def test_precision_follows_the_device():
     assert choose_precision("auto", torch.device("cuda")) == torch.float16
     assert choose_precision("float32", torch.device("cuda")) is None
     assert choose_precision("bfloat16", torch.device("cpu")) == torch.bfloat16
+
+
+def test_volumes_are_stored_while_they_fit():
+    auto = DroidConfig()
+    assert keep_volumes(auto, (48, 64), torch.float16) and keep_volumes(auto, (48, 64), torch.float32)
+    assert not keep_volumes(auto, (78, 78), torch.float16)
+    assert keep_volumes(DroidConfig(correlation="stored"), (78, 78), torch.float32)
+    assert not keep_volumes(DroidConfig(correlation="on_the_fly"), (8, 8), torch.float32)
 
 
 def test_poses_are_inverted_once():
