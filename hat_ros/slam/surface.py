@@ -113,6 +113,7 @@ class SurfacePrior:
         scale *= (self._units_per_m / scale) ** _SCALE_PULL
         rays = np.concatenate([past.xn[slots], np.ones((len(slots), 1))], axis=1)
         points = (rays * (scale * z_m)[:, None] - t) @ R
+        window.look_stamp_ns = past.stamp_ns
         new = window.n_looks[slots] == 0
         window.n_looks[slots] += 1
         share = (1.0 / np.minimum(window.n_looks[slots], _MEAN_OF_LOOKS))[:, None]

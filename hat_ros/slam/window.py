@@ -58,7 +58,8 @@ class Window:
         R, t: (W, 3, 3), (W, 3) poses ``p_cam = R p_slam + t``.
         xn, seen: (W, N, 2), (W, N) normalised observations and which of them exist.
         X: (N, 3) points. X_guess, guess_info: where their neighbours put them, and how firmly (1/unit^2).
-        X_surface, surface_info: (N, 3), (N,) where the CAD surface puts them after n_looks (N,) looks.
+        X_surface, surface_info: (N, 3), (N,) where the CAD surface puts them after n_looks (N,) looks,
+            the last one from the frame look_stamp_ns.
         R_fused, fused_info: (W, 3, 3), (W,) rotations that fused poses suggest.
         trusts_prior: whether the adjustment uses the CAD surface and fused rotations.
         cost: of the last adjustment; covariance: (12, 12) of the last two poses.
@@ -92,6 +93,7 @@ class Window:
         self.R_fused = np.eye(3)[None].copy()
         self.fused_info = np.zeros(1)
         self.trusts_prior = False
+        self.look_stamp_ns = stamp_ns
         # Standard deviations of the accelerations, rad/s^2 and units/s^2.
         self._acceleration = agility * np.array(
             [np.radians(config.turn_acceleration_deg_s2), config.move_acceleration_radii_s2 * radius]
@@ -216,14 +218,21 @@ class Window:
         known = self.n_looks > 0
         X = np.where(known[:, None], self.X_surface, self.X)
         R, t = self.R.copy(), self.t.copy()
-        for k in range(len(self)):
+        first = int(np.argmin(np.abs(np.array(self.stamps_ns, dtype=np.int64) - self.look_stamp_ns)))
+        # Outwards from the frame of the look, each from its neighbour: the present poses may be far off.
+        for k in [*range(first, len(self)), *range(first - 1, -1, -1)]:
             use = self.seen[k] & known
-            if np.count_nonzero(use) >= _MIN_SHARED_POINTS:
+            near = k if k == first else k - 1 if k > first else k + 1
+            if np.count_nonzero(use) < _MIN_SHARED_POINTS:
+                R[k], t[k] = R[near], t[near]
+                continue
+            for cutoff_px in (4 * _WIDE_CUTOFF_PX, _WIDE_CUTOFF_PX):
                 R[k], t[k], _ = refine_pose(
-                    R[k], t[k], X, self.xn[k], use, self.focal, self._config.sigma_px, _WIDE_CUTOFF_PX, R[k], t[k],
-                    1.0, 1.0, 8,
+                    R[near], t[near], X, self.xn[k], use, self.focal, self._config.sigma_px, cutoff_px, R[near],
+                    t[near], 1.0, 1.0, 6,
                 )  # fmt: skip
-        self._descend((R, t, X), self._problem(True), _RIVAL_ITERATIONS)
+                near = k
+        self._descend((R, t, X), self._problem(True)._replace(R_info=np.zeros(len(self))), _RIVAL_ITERATIONS)
         free = self._problem(False)
         present = window_cost(self.R, self.t, self.X, free)
         allowed = max(present / _TRUST_SHARE, present + _TRUST_LOSS * np.count_nonzero(self.seen))
