@@ -21,10 +21,12 @@ _BLOCK_BYTES = 1 << 20
 def code_version() -> str:
     """Commit of the checkout, with ``+changes`` when files differ from it; the package version when installed."""
     root = Path(__file__).resolve().parent.parent
+    if not (root / ".git").exists():  # installed, perhaps within somebody else's checkout
+        return _version("hat_ros") or "unknown"
     try:
         commit = _git(root, "rev-parse", "HEAD")
         changed = _git(root, "status", "--porcelain", "--untracked-files=no", "--", "hat_ros", "config")
-    except (OSError, subprocess.CalledProcessError):
+    except (OSError, subprocess.SubprocessError):
         return _version("hat_ros") or "unknown"
     return commit + ("+changes" if changed else "")
 
