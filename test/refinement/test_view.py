@@ -1,0 +1,77 @@
+import numpy as np
+import pytest
+from shape_scene import CAMERA, random_pose, spacecraft
+
+from hat_ros import lie
+from hat_ros.refinement.refiner import PoseFitter
+from hat_ros.refinement.view import MaskField, TargetViewer
+from hat_ros.render import create_renderer
+from hat_ros.types import Camera
+
+BLACK = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+
+
+@pytest.fixture(scope="module")
+def viewer():
+    return TargetViewer(spacecraft())
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_silhouette_is_that_of_the_renderer(viewer, seed):
+    T = random_pose(np.random.default_rng(seed), viewer.target)
+    view = viewer.view(T, CAMERA, 160)
+    full = create_renderer("embree", viewer.target).render(T, view.camera, color=False)
+    assert np.count_nonzero(view.mask != full.mask) <= 0.002 * np.count_nonzero(full.mask)
+
+
+def test_the_true_pose_overlaps_its_own_mask(viewer):
+    T = random_pose(np.random.default_rng(2), viewer.target)
+    mask = create_renderer("embree", viewer.target).render(T, CAMERA, color=False).mask
+    field = MaskField(mask)
+    areas = field.compare(viewer.view(T, CAMERA, 160), BLACK)
+    assert areas.union_share > 0.96
+    assert areas.common + areas.extra == pytest.approx(np.count_nonzero(mask))
+    assert field.compare(viewer.view(T, CAMERA, 160), BLACK, tolerance_px=1.0).extra < 2.0
+
+
+def test_what_lies_outside_the_image_counts_nowhere(viewer):
+    T = random_pose(np.random.default_rng(2), viewer.target, range_m=(5.0, 5.2))
+    T[0, 3] += 1.3
+    mask = create_renderer("embree", viewer.target).render(T, CAMERA, color=False).mask
+    assert mask[:, -1].any()
+    assert MaskField(mask).compare(viewer.view(T, CAMERA, 160), BLACK).union_share > 0.95
+
+
+def test_the_field_measures_pixels_from_the_outline():
+    mask = np.zeros((60, 80), bool)
+    mask[20:40, 30:60] = True
+    field = MaskField(mask)
+    x0, y0 = field.origin_px.astype(int)
+    assert field.distance[30 - y0, 25 - x0] == pytest.approx(4.5, abs=0.1)
+    assert field.distance[30 - y0, 33 - x0] == pytest.approx(-3.5, abs=0.1)
+    assert field.centroid_px == pytest.approx([44.5, 29.5])
+    assert field.area_px == 600
+
+
+@pytest.mark.parametrize("shift_px", [(30, -20), (-60, 10)])
+def test_centring_finds_a_target_that_has_drifted(viewer, shift_px):
+    T_true = random_pose(np.random.default_rng(6), viewer.target)
+    field = MaskField(create_renderer("embree", viewer.target).render(T_true, CAMERA, color=False).mask)
+    start = T_true.copy()
+    start[:2, 3] += np.array(shift_px) * T_true[2, 3] / CAMERA.K[0, 0]
+    centred = PoseFitter(viewer, 160, 300).centred(start, CAMERA, field, BLACK)
+    assert np.abs(centred[:2, 3] - T_true[:2, 3]).max() < 4 * T_true[2, 3] / CAMERA.K[0, 0]
+    np.testing.assert_array_equal(centred[:3, :3], T_true[:3, :3])
+
+
+def test_out_of_view_is_none(viewer):
+    assert viewer.view(lie.transform(np.eye(3), np.array([0.0, 0.0, -5.0])), CAMERA, 96) is None
+    assert viewer.view(np.full((4, 4), np.nan), CAMERA, 96) is None
+    aside = viewer.view(lie.transform(np.eye(3), np.array([40.0, 0.0, 5.0])), CAMERA, 96)
+    assert aside is None or not aside.mask.any()
+
+
+def test_a_large_image_costs_no_larger_crop(viewer):
+    camera = Camera(np.array([[4000.0, 0, 2000], [0, 4000.0, 1500], [0, 0, 1]]), 4000, 3000)
+    view = viewer.view(random_pose(np.random.default_rng(0), viewer.target), camera, 96)
+    assert max(view.mask.shape) <= 102
