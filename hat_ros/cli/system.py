@@ -48,7 +48,8 @@ def _weights(arguments: argparse.Namespace) -> int:
     if arguments.action == "check":
         found = [checkpoint.check(name, arguments.weights) for name in names]
         for status in found:
-            print(f"{status.checkpoint.name}: {'ok' if status.usable else 'missing'}: {status.message}")
+            name = status.checkpoint.name
+            print(f"{name}: {'ok' if status.usable else 'missing'}: {status.message.removeprefix(f'{name}: ')}")
         return 0 if all(status.usable for status in found) else 1
     table = Table(title=f"weights folder: {checkpoint.weights_folder(arguments.weights)}")
     for heading in ("name", "file below the folder", "size", "licence", "source", "SHA-256"):
