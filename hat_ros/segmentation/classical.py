@@ -44,6 +44,7 @@ _FOUND_BONUS = 0.1
 _MOTION_RELIEF = 0.1  # ... a mask that motion could have spoken against needs less, ...
 _CUT_SURCHARGE = 0.1  # ... one that the border cuts needs more, since part of a silhouette fits many things.
 _BENEFIT_OF_DOUBT = 0.1  # less plausibility keeps a mask than finds one
+_OPEN_BETTER = 0.012  # plausibility by which a cut with an open side must beat the closed one
 _CLEARLY_BETTER = 0.025  # plausibility by which one explanation must beat the simpler one
 # A second bright region with this share of the largest makes the choice a question; less where the border cuts the
 # largest, which may then be a planet.
@@ -151,7 +152,7 @@ class ClassicalSegmenter:
             return None
         sizes = [np.count_nonzero(r) for r in regions]
         main: int | None = 0
-        silhouette = self._silhouette(frame, prior)
+        silhouette = self._silhouette(frame, prior if prior is not None and prior.healthy else None)
         cut = sky.touches_border(regions[0])
         rivals = [i for i, size in enumerate(sizes) if size >= (_RIVAL_SHARE_CUT if cut else _RIVAL_SHARE) * sizes[0]]
         if cut or len(rivals) > 1:
@@ -231,41 +232,59 @@ class ClassicalSegmenter:
     def _track(self, frame: Frame, prior: PosePrior | None) -> tuple[Mask | None, bool]:
         """Follow the previous mask into this frame; the predicted silhouette helps while the two agree.
 
+        A prediction that nobody vouches for yet is tried as well: it is followed where it makes the mask more
+        plausible and its outline no less clear.
+
         Returns:
-            The mask, None when it was lost, and whether the prediction helped.
+            The mask, None when it was lost, and whether a healthy prediction helped.
         """
         assert self._mask is not None
         dx, dy = self._shift()
         x, y, w, h = cv2.boundingRect(self._mask)
         box = (x + dx, y + dy, x + w + dx, y + h + dy)
-        silhouette = self._silhouette(frame, prior)
-        if (
-            silhouette is not None
-            and _overlap(silhouette, _moved(self._mask, dx, dy)) >= self._config.min_prior_overlap
-        ):
-            u, v, a, b = cv2.boundingRect(silhouette)
-            box = (min(box[0], u), min(box[1], v), max(box[2], u + a), max(box[3], v + b))
-        else:
-            silhouette = None
-        aided = silhouette is not None
         margin = _MARGIN_PX + _MARGIN_SHARE * max(w, h)
+        silhouette = self._silhouette(frame, prior)
+        if silhouette is not None:
+            if _overlap(silhouette, _moved(self._mask, dx, dy)) < self._config.min_prior_overlap:
+                silhouette = None
+            else:
+                u, v, a, b = cv2.boundingRect(silhouette)
+                box = (min(box[0], u), min(box[1], v), max(box[2], u + a), max(box[3], v + b))
         window = self._window(frame, box, 2.5 * margin)
         if window is None:
+            return None, False
+        before = window.reduce(self._mask, (dx, dy))
+        expected = None if silhouette is None else window.reduce(silhouette)
+        aided = expected is not None and prior is not None and prior.healthy
+        tried = region.ColorModels(self._models.background.copy(), self._models.foreground.copy())
+        best = self._cut(window, [before] if not aided else [expected, before], margin, self._models)
+        if expected is not None and not aided:
+            other = self._cut(window, [expected, before], margin, tried)
+            if other is not None and (best is None or self._is_better(other, best)):
+                best, self._models = other, tried
+        if best is None:
             return None, aided
-        seeds = [window.reduce(self._mask, (dx, dy))]
-        if silhouette is not None:
-            seeds.insert(0, window.reduce(silhouette))
-        cut = region.cut_from_seeds(window.rgb, seeds, margin * window.scale, self._models)
+        self._contrast += _CONTRAST_GAIN * (best.contrast - self._contrast)
+        return self._finish(frame, window, best.mask), aided
+
+    def _cut(
+        self, window: _Window, seeds: list[Mask], margin: float, models: region.ColorModels
+    ) -> region.ClearCut | None:
+        """Cut from reduced seeds, the last of them the previous mask; None when it leads away or loses contrast."""
+        cut = region.cut_from_seeds(window.rgb, seeds, margin * window.scale, models)
         if cut is None:
-            return None, aided
+            return None
         grown = np.count_nonzero(cut) / max(1, np.count_nonzero(seeds[-1]))
         if not 1 / _MAX_AREA_CHANGE <= grown <= _MAX_AREA_CHANGE or _overlap(cut, seeds[0]) < _MIN_CONTINUITY:
-            return None, aided
+            return None
         contrast, _ = region.edge_contrast(window.rgb, cut)
         if contrast < max(_MIN_CONTRAST, _MIN_CONTRAST_KEPT * self._contrast):
-            return None, aided
-        self._contrast += _CONTRAST_GAIN * (contrast - self._contrast)
-        return self._finish(frame, window, cut), aided
+            return None
+        return region.ClearCut(cut, contrast)
+
+    def _is_better(self, other: region.ClearCut, than: region.ClearCut) -> bool:
+        gain = self._bank.overlap(other.mask.astype(bool)) - self._bank.overlap(than.mask.astype(bool))
+        return other.contrast >= than.contrast and gain >= _OPEN_BETTER
 
     def _shift(self) -> tuple[int, int]:
         """Whole pixels (x, y) that the target moved in the last frame; none while the image border cuts it."""
@@ -319,9 +338,9 @@ class ClassicalSegmenter:
         cuts = [region.cut_from_nothing(whole.rgb)]
         if motion is not None:
             cuts.append(region.cut_from_motion(whole.rgb, motion.moving))
-        cuts += [region.cut_from_nothing(whole.rgb, (side,)) for side in open_sides]
+        cuts += [region.cut_from_nothing(whole.rgb, side, cuts[0]) for side in open_sides]
         # Without motion an open side may let the background in: the first, closed cut is the safest.
-        margin = _CLEARLY_BETTER if motion is None else 0.0
+        margin = _OPEN_BETTER if motion is None else 0.0
         best, best_score = None, -np.inf
         for cut in cuts:
             if cut is None:
@@ -376,8 +395,8 @@ class ClassicalSegmenter:
         return _Window(x0, y0, x1 - x0, y1 - y0, scale, rgb)
 
     def _silhouette(self, frame: Frame, prior: PosePrior | None) -> Mask | None:
-        """The predicted silhouette (H, W) of a healthy prior, None without one or when it is out of sight."""
-        if prior is None or not prior.healthy or not np.isfinite(prior.pose_row).all():
+        """The predicted silhouette (H, W), None without a prior or when it is out of sight."""
+        if prior is None or not np.isfinite(prior.pose_row).all():
             return None
         camera = frame.camera
         scale = min(1.0, 2 * self._config.work_side_px / max(camera.width, camera.height))

@@ -90,16 +90,20 @@ def _compare(now: NDArray[np.uint8], before: NDArray[np.uint8]) -> tuple[NDArray
     grey_now = cv2.cvtColor(now, cv2.COLOR_RGB2GRAY).astype(np.float32)
     grey_before = cv2.cvtColor(before, cv2.COLOR_RGB2GRAY).astype(np.float32)
     border = _border(grey_now.shape)
+    everything = np.full(grey_now.shape, 255, np.uint8)
+    size = now.shape[1::-1]
     best_cost = np.inf
     for shift in _shifts(grey_before, grey_now):
-        moved = cv2.warpAffine(before, shift, now.shape[1::-1], flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        moved = cv2.warpAffine(before, shift, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        seen = cv2.warpAffine(everything, shift, size, flags=cv2.INTER_LINEAR) == 255
         change = cv2.absdiff(now, moved).max(axis=2)
-        cost = float(change[border].mean())
+        cost = float(change[border & seen].mean())
         if cost < best_cost:
-            best, best_change, best_cost = moved, change, cost
+            best, best_change, best_seen, best_cost = moved, change, seen, cost
     above = cv2.subtract(now, cv2.dilate(best, _K3))
     below = cv2.subtract(cv2.erode(best, _K3), now)
-    return cv2.max(above, below).max(axis=2), best_change
+    # What has come into view since has no past to compare with.
+    return cv2.max(above, below).max(axis=2) * best_seen, np.where(best_seen, best_change, 255)
 
 
 def _shifts(before: NDArray[np.float32], now: NDArray[np.float32]) -> list[NDArray[np.float64]]:

@@ -20,7 +20,7 @@ _COLD_ITERATIONS = 3
 _RING_SHARE = 0.02  # width of the image border taken as background, of the longer side
 _PIECE_SHARE = 0.03  # pieces smaller than this share of the largest are not the target's
 _MOTION_REACH = 0.6  # of the size of what moved: how far beyond it the target may extend
-_SIDES = ("top", "bottom", "left", "right")
+_OPEN_BESIDE = 0.25  # of what is known of the target: how far beyond its extent a side opens
 
 
 @dataclass
@@ -34,6 +34,14 @@ class ColorModels:
     def learned(self) -> bool:
         """Whether a cut has filled them."""
         return bool(self.background.any() and self.foreground.any())
+
+
+@dataclass(frozen=True)
+class ClearCut:
+    """A reduced (h, w) 0/1 mask with the colour step across its outline (see :func:`edge_contrast`)."""
+
+    mask: Mask
+    contrast: float
 
 
 def graph_cut(rgb: NDArray[np.uint8], labels: Mask, models: ColorModels, iterations: int) -> Mask | None:
@@ -66,25 +74,32 @@ def cut_from_seeds(rgb: NDArray[np.uint8], seeds: list[Mask], margin_px: float, 
     return None if cut is None else tidy(cut, every)
 
 
-def cut_from_nothing(rgb: NDArray[np.uint8], open_sides: tuple[str, ...] = ()) -> Mask | None:
+def cut_from_nothing(rgb: NDArray[np.uint8], open_side: str | None = None, near: Mask | None = None) -> Mask | None:
     """Cut with the image border as the only example of background.
 
     Args:
         rgb: (h, w, 3) reduced image.
-        open_sides: of top, bottom, left, right: sides where the target may reach the border.
+        open_side: top, bottom, left or right: there the target may reach the border.
+        near: 0/1 mask of what is known of the target; the side opens only beside it.
     """
     labels = np.full(rgb.shape[:2], cv2.GC_PR_FGD, np.uint8)
     ring = max(2, round(_RING_SHARE * max(rgb.shape[:2])))
-    views = {
-        "top": lambda depth: labels[:depth],
-        "bottom": lambda depth: labels[-depth:],
-        "left": lambda depth: labels[:, :depth],
-        "right": lambda depth: labels[:, -depth:],
-    }
-    for side in _SIDES:
-        views[side](ring)[:] = cv2.GC_BGD
-    for side in open_sides:
-        views[side](3 * ring)[:] = cv2.GC_PR_FGD
+    labels[:ring] = labels[-ring:] = cv2.GC_BGD
+    labels[:, :ring] = labels[:, -ring:] = cv2.GC_BGD
+    if open_side is not None:
+        rows, cols = slice(None), slice(None)
+        if near is not None:
+            x, y, w, h = cv2.boundingRect(near)
+            rows = slice(max(0, y - round(_OPEN_BESIDE * h)), y + h + round(_OPEN_BESIDE * h))
+            cols = slice(max(0, x - round(_OPEN_BESIDE * w)), x + w + round(_OPEN_BESIDE * w))
+        depth = 3 * ring
+        part = {
+            "top": np.s_[:depth, cols],
+            "bottom": np.s_[-depth:, cols],
+            "left": np.s_[rows, :depth],
+            "right": np.s_[rows, -depth:],
+        }[open_side]
+        labels[part] = cv2.GC_PR_FGD
     cut = graph_cut(rgb, labels, ColorModels(), _COLD_ITERATIONS)
     return None if cut is None else tidy(cut, None)
 

@@ -23,8 +23,8 @@ _RADII = 24
 _ANGLES = 64
 _EXTENT = 3.0  # largest radius of the grid, in radii of gyration; a rod seen from its end third stays inside
 _DISTANCE_RADII = 6.0  # range of the rendered views, in bounding radii: middle of what fills 5 to 50 % of an image
-_CUT_SHIFTS = (0.0, 0.25, 0.5, 0.75)  # of a cut mask: true centre beyond its own, in its radii of gyration
-_CUT_SCALES = (1.0, 1.2, 1.45)  # and true radius of gyration over its own
+# Of a cut mask: how far the true centre lies beyond its own, in its radii of gyration; the true radius over its own.
+_CUT_GUESSES = ((0.0, 1.0), (0.25, 1.0), (0.25, 1.2), (0.5, 1.2), (0.5, 1.45), (0.75, 1.45))
 
 
 class SilhouetteBank:
@@ -66,10 +66,9 @@ class SilhouetteBank:
             return self._overlap_at(_polar(image, center, radius), None)
         inside = np.ones_like(image)
         best = 0.0
-        for scale in _CUT_SCALES:
-            for shift in _CUT_SHIFTS:
-                at, size = center + shift * radius * outward, scale * radius
-                best = max(best, self._overlap_at(_polar(image, at, size), _polar(inside, at, size)))
+        for shift, scale in _CUT_GUESSES:
+            at, size = center + shift * radius * outward, scale * radius
+            best = max(best, self._overlap_at(_polar(image, at, size), _polar(inside, at, size)))
         return best
 
     def _overlap_at(self, polar: NDArray[np.float32], known: NDArray[np.float32] | None) -> float:

@@ -137,12 +137,15 @@ def fill_holes(mask: NDArray[np.uint8], max_share: float) -> NDArray[np.uint8]:
 
 
 def join_parts(regions: list[NDArray[np.uint8]], main: int) -> NDArray[np.uint8]:
-    """The main region with the others that lie within half its size of it: parts cut off by shadow."""
+    """The main region with the others that lie within half its size of it: parts cut off by shadow.
+
+    What the image border cuts is not joined to what it does not cut: that may be a planet.
+    """
     out = regions[main].copy()
     x, y, w, h = cv2.boundingRect(out)
     margin = 0.5 * max(w, h)
     for index, region in enumerate(regions):
-        if index == main:
+        if index == main or (touches_border(region) and not touches_border(regions[main])):
             continue
         u, v, a, b = cv2.boundingRect(region)
         near_x = u >= x - margin and u + a <= x + w + margin

@@ -100,6 +100,22 @@ def test_a_wrong_prior_does_not_change_a_mask_before_black_sky(stage, scene):
         assert overlap(stage.update(frame(1 + index, rgb), prior(wrong)).mask, alone) > 0.97
 
 
+def planet(scene, T, center, radius):
+    """The scene's picture with a bright mottled disc behind it."""
+    rgb = scene.image(T)
+    disc = cv2.circle(np.zeros((HEIGHT, WIDTH), np.uint8), center, radius, 1, -1)
+    behind = (disc > 0) & ~cv2.dilate(scene.truth(T).astype(np.uint8), np.ones((3, 3))).astype(bool)
+    rgb[behind] = scene.ground[:HEIGHT, :WIDTH][behind].astype(np.uint8)
+    return rgb
+
+
+@pytest.mark.parametrize("center", [(330, 260), (340, 120), (-10, 250)])
+def test_a_planet_cut_by_the_border_is_not_the_target(stage, scene, center):
+    T = scene.pose(0.3, x=0.5 if center[0] < 0 else -0.5, y=-0.3)
+    found = stage.update(frame(0, planet(scene, T, center, 90)), None)
+    assert overlap(found.mask, scene.truth(T)) > 0.85
+
+
 # Textured, moving background ---------------------------------------------------------------------------------------
 
 
@@ -121,8 +137,9 @@ def test_a_prior_keeps_the_mask(stage, scene):
     assert (run(stage, scene, lambda T, i: prior(T) if i > 4 else None, frames=20) > 0.92).all()
 
 
+@pytest.mark.parametrize("healthy", [True, False])
 @pytest.mark.parametrize("kind", ["turned", "elsewhere", "nearer", "nan", "behind"])
-def test_a_wrong_prior_neither_makes_nor_breaks_a_mask(stage, scene, kind):
+def test_a_wrong_prior_neither_makes_nor_breaks_a_mask(stage, scene, kind, healthy):
     def wrong(T, i):
         T = T.copy()
         if kind == "turned":
@@ -135,7 +152,7 @@ def test_a_wrong_prior_neither_makes_nor_breaks_a_mask(stage, scene, kind):
             T[:] = np.nan
         else:
             T[2, 3] = -5.0
-        return prior(T)
+        return prior(T, healthy)
 
     assert (run(stage, scene, wrong) > 0.85).all()
 
