@@ -186,9 +186,11 @@ class ClassicalSegmenter:
         """
         for known in (self._mask, silhouette):
             if known is not None:
-                shared = [_overlap(regions[i], known) for i in rivals]
-                if max(shared) >= 0.5:
-                    return rivals[int(np.argmax(shared))]
+                shared = {i: np.count_nonzero(regions[i] & known) for i in rivals}
+                most = max(rivals, key=lambda i: shared[i])
+                size = np.count_nonzero(regions[most])
+                if shared[most] >= _MIN_CONTINUITY * size and size <= _MAX_AREA_CHANGE * np.count_nonzero(known):
+                    return most
         shape = {i: self._bank.overlap(_shrink(regions[i], self._config.cold_side_px).astype(bool)) for i in rivals}
         whole = [i for i in rivals if not sky.touches_border(regions[i])]
         best = max(whole, key=lambda i: shape[i], default=None)
