@@ -56,7 +56,8 @@ def _panel(axis: Axes, rows: Sequence[dict[str, Any]]) -> None:
     speed = axis.twinx()
     speed.plot(x, fps, "D", color=_DIAMOND_COLOR, markersize=6, markeredgecolor="black", markeredgewidth=0.6)
     speed.set_ylabel("frames/s", fontsize=9, color=_DIAMOND_COLOR)
-    speed.set_ylim(bottom=0)
+    fastest = np.nanmax(fps) if np.isfinite(fps).any() else 1.0
+    speed.set_ylim(0, 1.15 * fastest)
 
 
 def _label(row: dict[str, Any], rows: Sequence[dict[str, Any]]) -> str:
