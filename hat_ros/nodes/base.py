@@ -49,6 +49,7 @@ class HatNode(LifecycleNode):
 
     NAME: ClassVar[str]
     EXTRA_PARAMETERS: ClassVar[dict[str, tuple[Any, str]]] = {}
+    GOES_ON_LIVE: ClassVar[bool] = True
 
     def __init__(self, *, context: rclpy.Context | None = None, parameters: dict[str, Any] | None = None) -> None:
         super().__init__(
@@ -147,6 +148,8 @@ class HatNode(LifecycleNode):
         except HatError as error:
             self.fail(error)
         except Exception as error:
+            if not self.context.ok():  # a signal came in between: there is nothing left to publish with
+                return
             self.get_logger().error(traceback.format_exc())
             self.fail(RunError(f"{type(error).__name__}: {error}"))
 
@@ -154,7 +157,7 @@ class HatNode(LifecycleNode):
         """Say what went wrong; a replay ends, a live graph goes on (its next epoch starts without this frame)."""
         self.get_logger().error(str(error))
         self.report(ERROR, str(error))
-        if not self.settings.live or not self.active:
+        if not (self.settings.live and self.active and self.GOES_ON_LIVE):
             self.failure = error
 
     def report(self, level: int, text: str) -> None:
@@ -206,6 +209,8 @@ class HatNode(LifecycleNode):
         self._publish_diagnostics()
 
     def _publish_diagnostics(self) -> None:
+        if not self.context.ok():
+            return
         name = f"hat: {self.NAME}"
         message = self.wire.diagnostics(time.time_ns(), name, self._level, self._text, self.values())
         self._diagnostics.publish(message)

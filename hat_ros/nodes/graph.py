@@ -22,6 +22,7 @@ import rclpy
 import yaml
 from numpy.typing import NDArray
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
 
 from hat_ros.bag import TYPESTORE, BagReader
 from hat_ros.config import HatConfig, config_to_dict
@@ -165,7 +166,7 @@ class _Run:
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._logs: list[IO[bytes]] = []
         self._context = rclpy.Context()
-        rclpy.init(args=[], context=self._context, domain_id=domain, signal_handler_options=_NO_SIGNALS)
+        rclpy.init(args=[], context=self._context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._nodes: list[base.HatNode] = []
         self._peak_memory_mib: dict[str, float] = {}
@@ -323,6 +324,3 @@ class _Run:
             if first <= stamp_ns <= last:
                 message = make.pose(stamp_ns, self._reader.frame_id, row)
                 self._recorder.writer.write_message(topics.GROUND_TRUTH, message, stamp_ns)
-
-
-_NO_SIGNALS = rclpy.signals.SignalHandlerOptions.NO

@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
+from rclpy.duration import Duration
 
 from hat_ros.bag import BagReader, Packet
 from hat_ros.errors import ConfigError, StageTimeoutError
@@ -31,6 +32,8 @@ class PlayerNode(base.HatNode):
     """
 
     NAME = "player"
+    GOES_ON_LIVE = False
+    published = n_status = dropped = 0
     EXTRA_PARAMETERS: ClassVar = {
         "bag": ("", "bag to play"),
         "image_topic": ("", "topic of the images in the bag, empty = find it"),
@@ -90,7 +93,7 @@ class PlayerNode(base.HatNode):
 
     def values(self) -> dict[str, Any]:
         """Figures for diagnostics."""
-        return {"published": self.published, "answered": self.n_status} if hasattr(self, "published") else {}
+        return {"published": self.published, "answered": self.n_status}
 
     @property
     def outstanding(self) -> int:
@@ -130,13 +133,24 @@ class PlayerNode(base.HatNode):
         while self._next is not None and self._may_send(self._next):
             self._send(self._next)
             self._next = next(self._packets, None)
-        if self.outstanding > 0:
-            first = self.n_status == 0
-            graph = self.settings.config.graph
-            limit_s = graph.startup_timeout_s if first else graph.stage_timeout_s
-            self._check_time(limit_s, f"frame {self.published - self.outstanding} was not answered")
-        elif self._next is None and not self.finished:
+        if self._is_done():
             self._finish()
+        elif self.outstanding > 0 and not (self.settings.live and self.n_status):
+            graph = self.settings.config.graph
+            limit_s = graph.stage_timeout_s if self.n_status else graph.startup_timeout_s
+            self._check_time(limit_s, f"frame {self.published - self.outstanding} was not answered")
+
+    def _is_done(self) -> bool:
+        """Everything sent was answered or dropped; live, where a hanging stage costs frames, the last one was."""
+        if self._next is not None or self.finished:
+            return False
+        if self.outstanding <= 0 or not self.settings.live:
+            return self.outstanding <= 0
+        last_ns = max(self.sent_s)
+        if self.last_status is not None and self.last_status.estimate.stamp_ns == last_ns:
+            return True
+        quiet_s = time.monotonic() - max(self.progress_s, self.sent_s[last_ns])
+        return quiet_s > self.settings.config.graph.stage_timeout_s
 
     def _may_send(self, packet: Packet) -> bool:
         if not self.settings.live:
@@ -167,6 +181,7 @@ class PlayerNode(base.HatNode):
     def _finish(self) -> None:
         stamp_ns = max(self.sent_s, default=0)
         self._end.publish(self.wire.header(stamp_ns, self.bag.frame_id))
+        self._end.wait_for_all_acked(Duration(seconds=5))
         self.finished = True
 
     def _check_time(self, limit_s: float, what: str) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
 
 from hat_ros.errors import HatError
 from hat_ros.nodes.base import HatNode
@@ -39,7 +40,11 @@ def main(node_classes: Sequence[type[HatNode]], args: Sequence[str] | None = Non
     """Entry point of every node process: 0 done, 1 failed, 2 bad input, with one sentence on stderr."""
     prepare_environment()
     context = rclpy.Context()
-    rclpy.init(args=list(sys.argv if args is None else args), context=context)
+    rclpy.init(
+        args=list(sys.argv if args is None else args),
+        context=context,
+        signal_handler_options=SignalHandlerOptions.ALL,  # a stopped recorder must still close its bag
+    )
     executor = SingleThreadedExecutor(context=context)
     nodes: list[HatNode] = []
     try:

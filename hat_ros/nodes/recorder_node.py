@@ -23,6 +23,7 @@ class RecorderNode(base.HatNode):
     """
 
     NAME = "recorder"
+    GOES_ON_LIVE = False
     EXTRA_PARAMETERS: ClassVar = {"out": ("", "folder of the bag to write")}
     writer: BagWriter | None = None
 

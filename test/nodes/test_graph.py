@@ -98,11 +98,18 @@ def test_rejected_frames_are_counted_and_change_nothing(write_bag, config, in_pr
     assert status_column(found, "dropped_total")[-1] == 6
 
 
-def test_given_masks_meet_their_compressed_images(write_bag, config, tmp_path):
+def test_given_masks_compressed_images_and_no_refinement(write_bag, config, tmp_path):
     bag = write_bag("given", masks=True, image_format="png")
-    annotated = changed(config, segmentation={"backend": "annotated"})
-    expected = run_in_process(bag, annotated, tmp_path / "in_process")
-    _, found = play(bag, annotated, tmp_path / "out", graph="single", stage_delays_ms={"slam": 20})
+    plain = changed(
+        config,
+        segmentation={"backend": "annotated"},
+        refinement={"enabled": False},  # fusion sees no image
+        fusion={"confidence": "detection_area"},
+        prior={"enabled": False},
+        graph={"credits_replay": 16},
+    )
+    expected = run_in_process(bag, plain, tmp_path / "in_process")
+    _, found = play(bag, plain, tmp_path / "out", graph="single", stage_delays_ms={"slam": 20})
     for topic in expected:
         assert found[topic] == expected[topic], topic
 
