@@ -12,9 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hat_ros.segmentation.sky import fill_holes
-
-Mask = NDArray[np.uint8]
+from hat_ros.segmentation.masks import Mask, fill_holes
 
 _COLD_ITERATIONS = 3
 _RING_SHARE = 0.02  # width of the image border taken as background, of the longer side
@@ -29,6 +27,10 @@ class ColorModels:
 
     background: NDArray[np.float64] = field(default_factory=lambda: np.zeros((1, 65)))
     foreground: NDArray[np.float64] = field(default_factory=lambda: np.zeros((1, 65)))
+
+    def copy(self) -> ColorModels:
+        """The same models, free to adapt differently."""
+        return ColorModels(self.background.copy(), self.foreground.copy())
 
     @property
     def learned(self) -> bool:
@@ -115,13 +117,6 @@ def cut_from_motion(rgb: NDArray[np.uint8], moving: Mask) -> Mask | None:
     labels[hull > 0] = cv2.GC_PR_FGD
     cut = graph_cut(rgb, labels, ColorModels(), _COLD_ITERATIONS)
     return None if cut is None else tidy(cut, moving)
-
-
-def border_contact(mask: Mask) -> float:
-    """Share of a 0/1 mask's outline that is the image border, 0 to 1."""
-    at_border = sum(int(np.count_nonzero(side)) for side in (mask[0], mask[-1], mask[:, 0], mask[:, -1]))
-    contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return at_border / max(1, sum(len(contour) for contour in contours))
 
 
 def tidy(mask: Mask, anchor: Mask | None) -> Mask | None:

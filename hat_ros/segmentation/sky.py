@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hat_ros.segmentation.masks import fill_holes, touches_border
+
 # A sky pixel is at most this bright (8-bit, any channel); black level and noise of real cameras stay below.
 _SKY_MAX = 48
 _RING_PX = 8  # width of the image border that is looked at for the sky
@@ -123,19 +125,6 @@ def _trim_outline(region: NDArray[np.uint8], luma: NDArray[np.uint8], sky: Sky) 
     return inner
 
 
-def fill_holes(mask: NDArray[np.uint8], max_share: float) -> NDArray[np.uint8]:
-    """Fill enclosed holes smaller than a share of the mask's area: dark details, not gaps between parts."""
-    contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    if hierarchy is None or (hierarchy[0, :, 3] < 0).all():
-        return mask
-    out = mask.copy()
-    limit = max_share * np.count_nonzero(mask)
-    for contour, node in zip(contours, hierarchy[0], strict=True):
-        if node[3] >= 0 and cv2.contourArea(contour) <= limit:
-            cv2.drawContours(out, [contour], -1, 1, -1)
-    return out
-
-
 def join_parts(regions: list[NDArray[np.uint8]], main: int) -> NDArray[np.uint8]:
     """The main region with the others that lie within half its size of it: parts cut off by shadow.
 
@@ -194,8 +183,3 @@ def bridge_gaps(measured: Sky, lit: NDArray[np.uint8], side_px: int) -> list[NDA
         closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, kernel)[radius:-radius, radius:-radius]
         out.append(fill_holes(np.ascontiguousarray(closed), 1.0).astype(bool))
     return out
-
-
-def touches_border(mask: NDArray[np.uint8]) -> bool:
-    """Whether an (H, W) mask reaches the image border."""
-    return bool(mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())

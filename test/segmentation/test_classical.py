@@ -167,7 +167,7 @@ def test_a_prior_makes_no_mask_where_there_is_no_target(stage, scene):
 def test_a_mask_locked_onto_the_ground_is_given_up(stage, scene):
     wrong = np.zeros((HEIGHT, WIDTH), np.uint8)
     cv2.circle(wrong, (60, 60), 40, 1, -1)
-    stage._backend._mask = wrong
+    stage._backend._masks = (wrong, wrong)
     assert (run(stage, scene, lambda T, i: None, frames=20)[-10:] > 0.9).all()
 
 

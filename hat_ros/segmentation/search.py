@@ -1,0 +1,142 @@
+"""Finding the target before a textured background from nothing, and judging any mask on its own merits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hat_ros.config import ClassicalConfig
+from hat_ros.segmentation import region
+from hat_ros.segmentation.boundary import refine_outline
+from hat_ros.segmentation.masks import Mask, Window, shrink, touches_border
+from hat_ros.segmentation.motion import MotionDetector, MotionEvidence
+from hat_ros.segmentation.shape import SilhouetteBank
+
+MIN_CONTRAST = 8.0  # 8-bit colour step across the outline below which there is no outline
+OPEN_BETTER = 0.012  # plausibility by which a cut that takes a liberty must beat the one that does not
+# A target contains most of what moves against the background, and hardly any texture that moves with it. Every
+# hundredth short of that costs a hundredth of shape overlap; ...
+_MIN_FOUND = 0.6
+_MAX_STILL = 0.25
+_FOUND_BONUS = 0.1
+_MOTION_RELIEF = 0.1  # ... a mask that motion could have spoken against needs less, ...
+CUT_SURCHARGE = 0.1  # ... one that the border cuts needs more, since part of a silhouette fits many things.
+# How far an outline may move within a frame, of the target's length: 4 degrees and then some; and in pixels.
+_MARGIN_SHARE = 0.05
+_MARGIN_PX = 2.0
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search from nothing found.
+
+    Attributes:
+        mask: (H, W) uint8 of 0 and 1.
+        plausibility: see :meth:`Search.plausibility`.
+        contrast: colour step across the outline.
+        models: colours of both sides.
+    """
+
+    mask: Mask
+    plausibility: float
+    contrast: float
+    models: region.ColorModels
+
+
+class Search:
+    """Remembers how the background moves and finds what is not it."""
+
+    def __init__(self, config: ClassicalConfig, bank: SilhouetteBank) -> None:
+        self._config = config
+        self._bank = bank
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget earlier frames."""
+        self._motion = MotionDetector()
+
+    def push(self, rgb: NDArray[np.uint8]) -> None:
+        """Show it the newest image, (H, W, 3) uint8; to be called once per frame."""
+        self._window = Window.whole(rgb, self._config.cold_side_px)
+        self._motion.push(self._window.rgb)
+
+    def judge(self, mask: Mask) -> tuple[float, float]:
+        """Plausibility of a full-resolution mask in the newest image, and what a new find would need."""
+        small = shrink(mask, self._config.cold_side_px)
+        motion = self._motion.evidence()
+        return self._plausibility(small, motion), self._required(small, motion)
+
+    def find(self, rgb: NDArray[np.uint8], open_sides: tuple[str, ...]) -> Found | None:
+        """Find the target from nothing.
+
+        Args:
+            rgb: the newest image, as pushed.
+            open_sides: sides of the image at which it may be cut off.
+        """
+        whole = self._window
+        motion = self._motion.evidence()
+        cuts = [region.cut_from_nothing(whole.rgb)]
+        if motion is not None:
+            cuts.append(region.cut_from_motion(whole.rgb, motion.moving))
+        cuts += [region.cut_from_nothing(whole.rgb, side, cuts[0]) for side in open_sides]
+        # Without motion an open side may let the background in: the first, closed cut is the safest.
+        margin = OPEN_BETTER if motion is None else 0.0
+        best, best_score = None, -np.inf
+        for cut in cuts:
+            if cut is None:
+                continue
+            contrast, chance = region.edge_contrast(whole.rgb, cut)
+            if contrast < max(MIN_CONTRAST, chance):
+                continue
+            score = self._plausibility(cut, motion)
+            if score >= max(self._required(cut, motion), best_score + margin):
+                best, best_score = cut, score
+        if best is None:
+            return None
+        mask = whole.enlarge(best)
+        x, y, w, h = cv2.boundingRect(mask)
+        margin = margin_px(mask)
+        window = Window.around(rgb, (x, y, x + w, y + h), 2.5 * margin, self._config.work_side_px)
+        if window is None:
+            return None
+        models = region.ColorModels()
+        cut = region.cut_from_seeds(window.rgb, [window.reduce(mask)], margin * window.scale, models)
+        if cut is None:
+            return None
+        contrast, _ = region.edge_contrast(window.rgb, cut)
+        return Found(at_full_resolution(rgb, window, cut), best_score, contrast, models)
+
+    def _plausibility(self, mask: Mask, motion: MotionEvidence | None) -> float:
+        """How well a mask at the scale of a search is explained: its overlap with the nearest CAD silhouette, less
+        the doubt that motion raises: where something moves it is not, or what it holds moves with the background."""
+        doubt = 0.0
+        if motion is not None:
+            found = motion.found_share(mask)
+            doubt += max(0.0, _MIN_FOUND - found) + _FOUND_BONUS * (1.0 - found)
+            doubt += max(0.0, motion.still_share(mask) - _MAX_STILL)
+        return self._bank.overlap(mask.astype(bool)) - doubt
+
+    def _required(self, mask: Mask, motion: MotionEvidence | None) -> float:
+        """Plausibility that a mask needs: less where motion has its say, more where the border hides a part."""
+        required = self._config.min_shape_overlap
+        if motion is not None:
+            required -= _MOTION_RELIEF
+        return required + CUT_SURCHARGE if touches_border(mask) else required
+
+
+def margin_px(mask: Mask) -> float:
+    """How far the outline of a mask may move within a frame, in pixels."""
+    _, _, w, h = cv2.boundingRect(mask)
+    return _MARGIN_PX + _MARGIN_SHARE * max(w, h)
+
+
+def at_full_resolution(rgb: NDArray[np.uint8], window: Window, cut: Mask) -> Mask:
+    """A cut in a window as an (H, W) mask, its outline found anew at full resolution."""
+    rows, cols = slice(window.y0, window.y0 + window.height), slice(window.x0, window.x0 + window.width)
+    band = max(2, round(1 / window.scale) + 1)
+    mask = np.zeros(rgb.shape[:2], np.uint8)
+    mask[rows, cols] = refine_outline(np.ascontiguousarray(rgb[rows, cols]), window.enlarge(cut), band, MIN_CONTRAST)
+    return mask

@@ -1,0 +1,160 @@
+"""Following the target before a textured background from frame to frame, with checks that it is still the target."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hat_ros.config import ClassicalConfig
+from hat_ros.segmentation import region
+from hat_ros.segmentation.masks import SIDES, Mask, Window, moved, overlap, shift_between, touched_sides
+from hat_ros.segmentation.search import MIN_CONTRAST, OPEN_BETTER, Found, Search, at_full_resolution, margin_px
+from hat_ros.segmentation.shape import SilhouetteBank
+
+_MAX_AREA_CHANGE = 1.6  # from one frame to the next
+_MIN_CONTINUITY = 0.6  # overlap of a tracked mask with its seed
+_MIN_CONTRAST_KEPT = 0.4  # share of its usual contrast at which a tracked outline is lost
+_CONTRAST_GAIN = 0.2
+_AGREEMENT = 0.8  # overlap of two independent masks that mean the same target
+_SAME = 0.95  # overlap of two masks that are the same
+_BENEFIT_OF_DOUBT = 0.1  # less plausibility keeps a mask than finds one
+_CLEARLY_BETTER = 0.025  # plausibility by which another explanation must beat a predicted one
+_MAX_RETRY_FRAMES = 8
+_CHECK_UNAIDED_FRAMES = 3  # between checks of a mask that no prior holds in place; more while they find the same
+
+
+class TexturedBackground:
+    """Finds and follows the target before anything but a black sky."""
+
+    def __init__(self, config: ClassicalConfig, bank: SilhouetteBank) -> None:
+        self._config = config
+        self._bank = bank
+        self._search = Search(config, bank)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget earlier frames."""
+        self._search.reset()
+        self._models = region.ColorModels()
+        self._contrast = 0.0  # of the tracked outline, slowly following
+        self._since_check = 0
+        self._check_every = _CHECK_UNAIDED_FRAMES
+        self._failures = 0
+        self._wait = 0
+
+    def find(
+        self,
+        rgb: NDArray[np.uint8],
+        masks: tuple[Mask | None, Mask | None],
+        silhouette: Mask | None,
+        trusted: bool,
+    ) -> Mask | None:
+        """The target's mask, (H, W) uint8 of 0 and 1.
+
+        Args:
+            rgb: (H, W, 3) uint8 image.
+            masks: those of the frame before the previous one and of the previous one.
+            silhouette: prediction, None without one.
+            trusted: whether somebody vouches for the prediction.
+        """
+        self._search.push(rgb)
+        if masks[1] is not None:
+            tracked, aided = self._track(rgb, masks[1], shift_between(*masks), silhouette, trusted)
+            self._since_check += 1
+            due = self._since_check >= (self._config.check_interval_frames if aided else self._check_every)
+            if tracked is not None:
+                return self._cross_check(rgb, tracked, aided) if due else tracked
+        if self._wait > 0:
+            self._wait -= 1
+            return None
+        found = self._search.find(rgb, SIDES)
+        if found is None:
+            self._failures += 1
+            self._wait = min(2**self._failures, _MAX_RETRY_FRAMES) - 1
+            return None
+        self._failures = 0
+        return self._adopt(found)
+
+    def _adopt(self, found: Found) -> Mask:
+        """Go on from what a search found."""
+        self._since_check = 0
+        self._models = found.models
+        self._contrast = found.contrast
+        return found.mask
+
+    def _track(
+        self, rgb: NDArray[np.uint8], mask: Mask, shift_xy: tuple[int, int], silhouette: Mask | None, trusted: bool
+    ) -> tuple[Mask | None, bool]:
+        """Follow the previous mask into this frame; the predicted silhouette helps while the two agree.
+
+        A prediction that nobody vouches for yet is tried as well: it is followed where it makes the mask more
+        plausible and its outline no less clear.
+
+        Returns:
+            The mask, None when it was lost, and whether a trusted prediction helped.
+        """
+        dx, dy = shift_xy
+        x, y, w, h = cv2.boundingRect(mask)
+        box = (x + dx, y + dy, x + w + dx, y + h + dy)
+        margin = margin_px(mask)
+        if silhouette is not None and overlap(silhouette, moved(mask, dx, dy)) < self._config.min_prior_overlap:
+            silhouette = None
+        if silhouette is not None:
+            u, v, a, b = cv2.boundingRect(silhouette)
+            box = (min(box[0], u), min(box[1], v), max(box[2], u + a), max(box[3], v + b))
+        aided = silhouette is not None and trusted
+        window = Window.around(rgb, box, 2.5 * margin, self._config.work_side_px)
+        if window is None:
+            return None, False
+        seeds = [window.reduce(mask, shift_xy)]
+        tried = self._models.copy()
+        if silhouette is None:
+            best = self._cut(window, seeds, margin, self._models)
+        else:
+            with_silhouette = [window.reduce(silhouette), *seeds]
+            best = self._cut(window, with_silhouette if trusted else seeds, margin, self._models)
+            if not trusted:
+                other = self._cut(window, with_silhouette, margin, tried)
+                if other is not None and (best is None or self._is_better(other, best)):
+                    best, self._models = other, tried
+        if best is None:
+            return None, aided
+        self._contrast += _CONTRAST_GAIN * (best.contrast - self._contrast)
+        return at_full_resolution(rgb, window, best.mask), aided
+
+    def _cut(
+        self, window: Window, seeds: list[Mask], margin: float, models: region.ColorModels
+    ) -> region.ClearCut | None:
+        """Cut from reduced seeds, the last of them the previous mask; None when it leads away or loses contrast."""
+        cut = region.cut_from_seeds(window.rgb, seeds, margin * window.scale, models)
+        if cut is None:
+            return None
+        grown = np.count_nonzero(cut) / max(1, np.count_nonzero(seeds[-1]))
+        if not 1 / _MAX_AREA_CHANGE <= grown <= _MAX_AREA_CHANGE or overlap(cut, seeds[0]) < _MIN_CONTINUITY:
+            return None
+        contrast, _ = region.edge_contrast(window.rgb, cut)
+        if contrast < max(MIN_CONTRAST, _MIN_CONTRAST_KEPT * self._contrast):
+            return None
+        return region.ClearCut(cut, contrast)
+
+    def _is_better(self, other: region.ClearCut, than: region.ClearCut) -> bool:
+        gain = self._bank.overlap(other.mask.astype(bool)) - self._bank.overlap(than.mask.astype(bool))
+        return other.contrast >= than.contrast and gain >= OPEN_BETTER
+
+    def _cross_check(self, rgb: NDArray[np.uint8], tracked: Mask, aided: bool) -> Mask | None:
+        """Compare a tracked mask with what a search from nothing finds; keep the more plausible one.
+
+        A mask held in place by a prediction is given up only for one that means something else.
+        """
+        self._since_check = 0
+        found = self._search.find(rgb, touched_sides(tracked))
+        agreement = 0.0 if found is None else overlap(found.mask, tracked)
+        longer = min(2 * self._check_every, self._config.check_interval_frames)
+        self._check_every = longer if agreement >= _SAME else _CHECK_UNAIDED_FRAMES
+        if aided and agreement >= _AGREEMENT:
+            return tracked
+        plausibility, required = self._search.judge(tracked)
+        if found is not None and found.plausibility > plausibility + (_CLEARLY_BETTER if aided else 0.0):
+            return self._adopt(found)
+        return tracked if aided or plausibility >= required - _BENEFIT_OF_DOUBT else None
