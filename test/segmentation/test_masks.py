@@ -32,7 +32,7 @@ def test_a_moved_mask_keeps_what_stays_inside(shift):
     mask = block(slice(20, 40), slice(30, 60))
     dx, dy = shift
     rows, cols = np.nonzero(mask)
-    inside = (0 <= rows + dy) & (rows + dy < 60) & (0 <= cols + dx) & (cols + dx < 90)
+    inside = (rows + dy >= 0) & (rows + dy < 60) & (cols + dx >= 0) & (cols + dx < 90)
     out = moved(mask, dx, dy)
     assert out.sum() == inside.sum()
     assert out[rows[inside] + dy, cols[inside] + dx].all()
