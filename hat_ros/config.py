@@ -126,7 +126,7 @@ class FeatureSlamConfig:
     move_acceleration_radii_s2: float = option(0.5, "of the linear acceleration, in target radii", low=1e-3)
     use_prior: bool = option(True, "let healthy priors bring CAD depth and rotation (needs prior.enabled)")
     surface_sigma: float = option(0.03, "uncertainty of CAD depth, share of the target's bounding radius", low=1e-3)
-    prior_turn_sigma_deg: float = option(0.5, "uncertainty of a fused rotation relative to others", low=0.01)
+    prior_turn_sigma_deg: float = option(0.3, "uncertainty of a fused rotation relative to others", low=0.01)
 
 
 @dataclass(frozen=True)
@@ -242,6 +242,7 @@ class RefinementConfig:
     switch_margin: float = option(0.05, "lead in image evidence that a second start within a basin needs", low=0)
     arbitration_margin: float = option(0.15, "summed lead in image evidence that decides between basins", low=0)
     certain_share: float = option(0.9, "overlap and support that need no second anchor to be TRACKING", low=0, high=1)
+    min_margin: float = option(2.0, "lead in path score over other basins that TRACKING needs", low=0)
 
 
 @dataclass(frozen=True)

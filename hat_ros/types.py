@@ -249,6 +249,18 @@ class Selection:
         """No keyframe at this frame."""
         return cls(Candidates.none(), np.zeros(0), np.zeros(0), -1)
 
+    def margin(self, apart_deg: float) -> float:
+        """Lead of the anchor's path score over the best candidate further than ``apart_deg`` from it.
+
+        Infinite when there is no other basin, negative when the decoder's own proposal was not accepted, NaN without
+        an anchor.
+        """
+        if self.selected < 0:
+            return float("nan")
+        R = self.candidates.T_cam_target[:, :3, :3]
+        rivals = self.path_score[lie.angle_between(R, R[self.selected]) > np.radians(apart_deg)]
+        return float(self.path_score[self.selected] - rivals.max(initial=-np.inf))
+
     @property
     def anchor(self) -> Float | None:
         """(4, 4) the selected ``T_cam_target``, or None."""
@@ -340,6 +352,8 @@ class Estimate:
         slam_epoch: epoch of the motion used.
         gap_frames: frames since the last frame with a measurement of its own (0 = this one has).
         n_resets: alignment resets since the start of the run.
+        margin: lead of the last anchor over the best candidate of another basin, in units of path score; NaN before
+            the first. The smaller, the more ambiguous; for people (diagnostics) and the state.
     """
 
     stamp_ns: int
@@ -354,6 +368,7 @@ class Estimate:
     slam_epoch: int = 0
     gap_frames: int = 0
     n_resets: int = 0
+    margin: float = float("nan")
 
     @cached_property
     def T_cam_target(self) -> Float:

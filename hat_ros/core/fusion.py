@@ -26,8 +26,8 @@ class FusionStage:
     """One :meth:`update` per frame; past outputs are never revised.
 
     States: UNINITIALISED before the first pose. TRACKING while poses are solved for: from anchors and motion, or, with
-    a refiner, supported by this frame's image and not doubtful. COASTING while the pose is only held, predicted, or in
-    doubt. LOST once ``coast_limit_frames`` went by without a measurement (an anchor, or a supported refinement); no
+    a refiner, supported by this frame's image, not doubtful, and the decoder's lead over other basins is at least
+    ``min_margin``. COASTING while the pose is only held, predicted, ambiguous, or in doubt. LOST once ``coast_limit_frames`` went by without a measurement (an anchor, or a supported refinement); no
     pose then.
     """
 
@@ -54,6 +54,7 @@ class FusionStage:
         self._gap_frames = 0
         self._n_resets = 0
         self._lost = False
+        self._margin = float("nan")
 
     def update(self, frame: Frame, detection: Detection | None, motion: Motion, selection: Selection) -> Estimate:
         """Estimate the pose of one frame.
@@ -67,6 +68,7 @@ class FusionStage:
         anchor, confidence = selection.anchor, 1.0
         if anchor is not None:
             confidence = self._confidence.update(box_area_px(selection.candidates.box_xyxy))
+            self._margin = selection.margin(self._config.fusion.gate_angle_deg)
         if self._refined is not None:
             fused = self._refined.update(frame, detection, motion, anchor, confidence)
         else:
@@ -91,6 +93,7 @@ class FusionStage:
             slam_epoch=motion.epoch,
             gap_frames=self._gap_frames,
             n_resets=self._n_resets,
+            margin=self._margin,
         )
 
     def _state(self, fused: Fused, motion: Motion) -> tuple[TrackState, Float | None]:
@@ -106,8 +109,12 @@ class FusionStage:
             self._last_pose = None
             return TrackState.LOST, None
         self._last_pose = T_cam_target
-        found = fused.T_cam_target is not None if self._refined is None else fused.measurement is not None
-        return (TrackState.TRACKING if found and not fused.doubtful else TrackState.COASTING), T_cam_target
+        if self._refined is None:
+            certain = fused.T_cam_target is not None
+        else:
+            ambiguous = self._margin < self._config.refinement.min_margin
+            certain = fused.measurement is not None and not fused.doubtful and not ambiguous
+        return (TrackState.TRACKING if certain else TrackState.COASTING), T_cam_target
 
     def _fill_gap(self, motion: Motion) -> Float | None:
         """The last pose, held, or turned by the SLAM rotation about a held position."""

@@ -29,6 +29,7 @@ class FusionNode(StageNode):
         """Build the stage and its endpoints."""
         super().configure()
         self._version = 0
+        self._margin = float("nan")
         readers = ("hypotheses", "slam") if self.settings.config.prior.enabled else ()
         names = (
             topics.TARGET_POSE,
@@ -56,8 +57,13 @@ class FusionNode(StageNode):
         self._publish_alignment(stamp_ns, estimate)
         if estimate.state.has_pose:
             self._publish_pose(frame_id, estimate)
+        self._margin = estimate.margin
         self._status.publish(self.wire.status(frame_id, estimate, admitted))
         self.report(base.OK, estimate.state.name.lower())
+
+    def values(self) -> dict[str, Any]:
+        """Figures for diagnostics; the smaller the margin, the more ambiguous the orientation."""
+        return {**super().values(), "margin": self._margin}
 
     def _image(self, stamp_ns: int, items: dict[str, Any]) -> tuple[Frame, Detection | None]:
         if topics.FRAME in items:
