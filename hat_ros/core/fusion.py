@@ -26,9 +26,9 @@ class FusionStage:
     """One :meth:`update` per frame; past outputs are never revised.
 
     States: UNINITIALISED before the first pose. TRACKING while poses are solved for: from anchors and motion, or, with
-    a refiner, supported by this frame's image, not doubtful, and the decoder's lead over other basins is at least
-    ``min_margin``. COASTING while the pose is only held, predicted, ambiguous, or in doubt. LOST once ``coast_limit_frames`` went by without a measurement (an anchor, or a supported refinement); no
-    pose then.
+    a refiner, supported by this frame's image, not doubtful, and with a lead of the decoder over other basins of at
+    least ``min_margin``. COASTING while the pose is only held, predicted, ambiguous, or in doubt. LOST once
+    ``coast_limit_frames`` went by without a measurement (an anchor, or a supported refinement); no pose then.
     """
 
     def __init__(self, config: HatConfig, refiner: Refiner | None) -> None:
