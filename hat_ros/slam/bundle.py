@@ -29,8 +29,10 @@ Bool = NDArray[np.bool_]
 
 # Nearer than this share of the unit (the target's distance at the start) a point counts as behind the camera.
 _MIN_DEPTH = 1e-3
-# Squared scale, in sigmas, of the loss on expected points and rotations.
-_EXPECTED_CUTOFF_SQ = 9.0
+# Squared scales, in sigmas, of the losses on expected points and rotations; rotations all share their gauge, so that a
+# drift across the window may set the outer ones far apart.
+_POINT_CUTOFF_SQ = 9.0
+_TURN_CUTOFF_SQ = 100.0
 _FIRST_DAMPING = 1e-4
 
 
@@ -245,11 +247,11 @@ def window_cost(R: Float, t: Float, X: Float, p: Problem) -> float:
     for i in range(N):
         if p.X_info[i] > 0.0:
             d = X[i] - p.X_expected[i]
-            cost += _loss(p.X_info[i] * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), _EXPECTED_CUTOFF_SQ)
+            cost += _loss(p.X_info[i] * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), _POINT_CUTOFF_SQ)
     for k in range(W):
         if p.R_info[k] > 0.0:
             d = turn_between(R[k], p.R_expected[k])
-            cost += _loss(p.R_info[k] * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), _EXPECTED_CUTOFF_SQ)
+            cost += _loss(p.R_info[k] * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), _TURN_CUTOFF_SQ)
     for k in range(1, W - 1):
         before, after = turn_between(R[k], R[k - 1]), turn_between(R[k + 1], R[k])
         for a in range(3):
@@ -299,7 +301,7 @@ def _add_pose_terms(S: Float, g: Float, R: Float, t: Float, p: Problem) -> None:
         if p.R_info[k] > 0.0:
             d = turn_between(R[k], p.R_expected[k])
             w = p.R_info[k]
-            w *= _weight(w * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), _EXPECTED_CUTOFF_SQ)
+            w *= _weight(w * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), _TURN_CUTOFF_SQ)
             for a in range(3):
                 S[6 * k + a, 6 * k + a] += w
                 g[6 * k + a] -= w * d[a]
@@ -343,7 +345,7 @@ def _add_observations(
     if p.X_info[i] > 0.0:
         d = X[i] - p.X_expected[i]
         w = p.X_info[i]
-        w *= _weight(w * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), _EXPECTED_CUTOFF_SQ)
+        w *= _weight(w * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), _POINT_CUTOFF_SQ)
         for a in range(3):
             V[a, a] += w
             b[a] -= w * d[a]

@@ -1,7 +1,7 @@
 """Backend ``feature``: target-relative motion from point tracks, without learned weights.
 
 Per frame: follow the points, locate the camera against the points known, adjust the window, emit. A pose once emitted
-is never revised. The window keeps improving its past, so what is emitted is the chain of its best increments.
+is never revised; what the window learns later about its past only shapes what is emitted next.
 """
 
 from __future__ import annotations
@@ -117,7 +117,6 @@ class FeatureSlam:
         if self._target is not None:
             self._surface = SurfacePrior(self._config, self._target, self._delay_frames)
             self._surface.remember(self._window, self._tracks.track_id)
-        self._R_emitted = np.eye(3)
         return self._motion()
 
     def _advance(self, stamp_ns: int, image: Image, region: Image, prior: PosePrior | None) -> bool:
@@ -141,7 +140,7 @@ class FeatureSlam:
                 self._surface.expect(window, tracks.track_id, prior)
         window.adjust()
         self._try_rivals()
-        self._R_emitted = window.R[-1] @ window.R[-2].T @ self._R_emitted
+        window.emit()
         self._replenish(image, region)
         return True
 
@@ -193,7 +192,7 @@ class FeatureSlam:
 
     def _motion(self) -> Motion:
         window = self._window
-        T_slam_cam = lie.inverse(lie.transform(self._R_emitted, window.t[-1]))
+        T_slam_cam = lie.inverse(lie.transform(window.R_emitted[-1], window.t[-1]))
         sigma_rad = window.step_sigma_rad() if len(window) > 1 else 0.0
         return Motion(True, self._epoch, lie.row_from_matrix(T_slam_cam), len(window), sigma_rad)
 

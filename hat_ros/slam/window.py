@@ -31,6 +31,8 @@ _PREDICTION_SLACK = 3.0
 _FIRST_TURN_RAD, _FIRST_MOVE_RADII = 0.35, 1.0
 # The structure of an epoch younger than this is a guess, so its tracks cannot be told from outliers yet.
 _YOUNG_FRAMES = 10
+# What is given out catches up with what the window knows of this many frames, by this share of the difference.
+_CATCH_UP_FRAMES, _CATCH_UP_SHARE = 8, 0.3
 _YOUNG_CUTOFFS = (8.0, 4.0, 2.0)
 # A rival solution must be this much cheaper, relative and absolute, to take over.
 _RIVAL_SHARE, _RIVAL_MARGIN = 0.9, 20.0
@@ -61,6 +63,7 @@ class Window:
         X_surface, surface_info: (N, 3), (N,) where the CAD surface puts them after n_looks (N,) looks,
             the last one from the frame look_stamp_ns.
         R_fused, fused_info: (W, 3, 3), (W,) rotations that fused poses suggest.
+        R_emitted: (W, 3, 3) rotations as they were given out.
         trusts_prior: whether the adjustment uses the CAD surface and fused rotations.
         cost: of the last adjustment; covariance: (12, 12) of the last two poses.
     """
@@ -92,6 +95,7 @@ class Window:
         self.n_looks = np.zeros(n, dtype=np.int64)
         self.R_fused = np.eye(3)[None].copy()
         self.fused_info = np.zeros(1)
+        self.R_emitted = np.eye(3)[None].copy()
         self.trusts_prior = False
         self.look_stamp_ns = stamp_ns
         # Standard deviations of the accelerations, rad/s^2 and units/s^2.
@@ -144,6 +148,7 @@ class Window:
         self.xn, self.seen = np.concatenate([self.xn, xn[None]]), np.concatenate([self.seen, seen[None]])
         self.R_fused = np.concatenate([self.R_fused, R[None]])
         self.fused_info = np.append(self.fused_info, 0.0)
+        self.R_emitted = np.concatenate([self.R_emitted, R[None]])
 
     def place(self, slots: NDArray[np.int64], xn: Float, z: Float, sigma: float) -> None:
         """New points in slots, seen by the newest frame at (n, 2) with expected depth (n,) +- sigma."""
@@ -172,7 +177,7 @@ class Window:
 
     def _remove(self, k: int) -> None:
         del self.stamps_ns[k], self.number[k]
-        for name in ("R", "t", "xn", "seen", "R_fused", "fused_info"):
+        for name in ("R", "t", "xn", "seen", "R_fused", "fused_info", "R_emitted"):
             setattr(self, name, np.delete(getattr(self, name), k, axis=0))
 
     def adjust(self) -> None:
@@ -249,6 +254,22 @@ class Window:
             return 1.0
         offset = np.linalg.norm(self.X[known] - self.X_surface[known], axis=1) * np.sqrt(self.surface_info[known])
         return float(np.mean(offset < 2.0))
+
+    def emit(self) -> None:
+        """Fix the newest rotation as it is given out: the last one turned by the best increment known now.
+
+        What the window has since learned about the increments before is made good, little by little, and never by
+        more than a step's own uncertainty.
+        """
+        chained = self.R[-1] @ self.R[-2].T @ self.R_emitted[-2]
+        recent = [k for k in range(len(self) - 2) if self.number[-1] - self.number[k] <= _CATCH_UP_FRAMES]
+        if recent:
+            owed = np.mean(
+                [turn_between(self.R[-1] @ self.R[k].T @ self.R_emitted[k], chained) for k in recent], axis=0
+            )
+            size = float(np.linalg.norm(owed))
+            chained = lie.so3_exp(owed * min(_CATCH_UP_SHARE, self.step_sigma_rad() / max(size, 1e-12))) @ chained
+        self.R_emitted[-1] = chained
 
     def step_sigma_rad(self) -> float:
         """One-sigma angle of the turn from the last frame but one to the last."""
