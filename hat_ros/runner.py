@@ -96,6 +96,7 @@ class ReplayOptions:
         credits: W, frames in flight; None = the configuration's.
         live: play in real time and let the graph drop what it cannot keep up with.
         rate: speed of live play.
+        domain: ROS domain, for nodes of one's own that listen; None = a free one, heard by nobody else.
         start, limit, video, report, overwrite: as in :class:`TrackOptions`.
     """
 
@@ -103,6 +104,7 @@ class ReplayOptions:
     credits: int | None = None
     live: bool = False
     rate: float = 1.0
+    domain: int | None = None
     start: int = 0
     limit: int | None = None
     video: bool = True
@@ -161,6 +163,7 @@ def replay_bag(
             credits=options.credits,
             live=options.live,
             rate=options.rate,
+            domain_id=options.domain,
             first_frame=options.start,
             max_frames=options.limit,
             on_progress=progress,

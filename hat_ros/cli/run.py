@@ -48,6 +48,12 @@ def _add_replay(commands: Commands) -> None:
     )
     parser.add_argument("--live", action="store_true", help="play in real time; frames are dropped, not queued")
     parser.add_argument("--rate", type=float, default=1.0, metavar="X", help="speed of --live play (default: 1)")
+    parser.add_argument(
+        "--domain",
+        type=natural,
+        metavar="ID",
+        help="ROS domain to play in, so that nodes of your own can listen (default: one that nobody else uses)",
+    )
     _add_common(parser)
     parser.set_defaults(command=_replay)
 
@@ -69,6 +75,7 @@ def _replay(arguments: argparse.Namespace) -> int:
         credits=arguments.credits,
         live=arguments.live,
         rate=arguments.rate,
+        domain=arguments.domain,
         start=arguments.start,
         limit=arguments.limit,
         video=not arguments.no_video,
