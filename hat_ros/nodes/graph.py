@@ -216,8 +216,9 @@ class _Run:
         while not player.finished:
             self._executor.spin_once(timeout_sec=0.1)
             self._check()
-            if player.n_status != done:
-                done = player.n_status
+            answered = min(player.n_status, self._recorder.counts[topics.STATUS])  # what is reported is also recorded
+            if answered != done:
+                done = answered
                 if self._on_progress is not None:
                     self._on_progress(Progress(done, player.total, player.last_status))
         self._await_exit()
@@ -295,7 +296,19 @@ class _Run:
             idle = 0 if sum(self._recorder.counts.values()) > before else idle + 1
 
     def close(self) -> None:
-        """End every process that is left, put the truth into the record, close the bag."""
+        """Record what has arrived, end every process that is left, put the truth into the record, close the bag."""
+        recording = len(self._nodes) == 2
+        with contextlib.ExitStack() as stack:  # each of these, last first, whatever happens to the others
+            stack.callback(self._context.try_shutdown)
+            stack.callback(close_nodes, self._executor, self._nodes)
+            if recording:
+                stack.callback(self._record_truth)
+            stack.callback(self._end_processes)
+            if recording:
+                self._player.active = False
+                self._drain()  # before the writers go: their unread messages go with them
+
+    def _end_processes(self) -> None:
         for process in self._processes.values():
             if process.poll() is None:
                 process.terminate()
@@ -307,14 +320,6 @@ class _Run:
                 process.wait()
         for log in self._logs:
             log.close()
-        try:
-            if len(self._nodes) == 2:
-                self._player.active = False
-                self._drain()
-                self._record_truth()
-        finally:
-            close_nodes(self._executor, self._nodes)
-            self._context.try_shutdown()
 
     def _record_truth(self) -> None:
         """The truth goes from the bag into the record, past every node."""
