@@ -29,7 +29,7 @@ from hat_ros.config import HatConfig, config_to_dict
 from hat_ros.errors import ConfigError, HatError, InputError, RunError, StageTimeoutError
 from hat_ros.nodes import base, topics
 from hat_ros.nodes.domain import reserved_domain
-from hat_ros.nodes.environment import prepare_environment
+from hat_ros.nodes.environment import keep_large_blocks, prepare_environment
 from hat_ros.nodes.player_node import PlayerNode
 from hat_ros.nodes.process import close as close_nodes
 from hat_ros.nodes.recorder_node import RecorderNode
@@ -128,6 +128,7 @@ def replay(
         config = replace(config, graph=replace(config.graph, credits_replay=credits))
     reader = BagReader(bag, image_topic=image_topic, camera_info_topic=camera_info_topic)
     prepare_environment()
+    keep_large_blocks()
     with tempfile.TemporaryDirectory(prefix="hat_replay_") as scratch, reserved_domain(domain_id) as domain:
         folder = Path(scratch)
         config_file = folder / "config.yaml"

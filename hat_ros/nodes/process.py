@@ -11,7 +11,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from hat_ros.errors import HatError
 from hat_ros.nodes.base import HatNode
-from hat_ros.nodes.environment import prepare_environment
+from hat_ros.nodes.environment import keep_large_blocks, prepare_environment
 
 
 def spin(executor: SingleThreadedExecutor, nodes: Sequence[HatNode]) -> HatError | None:
@@ -39,6 +39,7 @@ def close(executor: SingleThreadedExecutor, nodes: Sequence[HatNode]) -> None:
 def main(node_classes: Sequence[type[HatNode]], args: Sequence[str] | None = None) -> int:
     """Entry point of every node process: 0 done, 1 failed, 2 bad input, with one sentence on stderr."""
     prepare_environment()
+    keep_large_blocks()
     context = rclpy.Context()
     rclpy.init(
         args=list(sys.argv if args is None else args),
