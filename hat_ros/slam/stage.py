@@ -57,4 +57,5 @@ class MotionStage:
 
 def suppress_background(rgb: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Black outside the mask: (H, W, 3) uint8, (H, W) bool -> (H, W, 3) uint8."""
-    return cv2.bitwise_and(rgb, rgb, mask=mask.view(np.uint8))  # ten times faster than a broadcast product
+    # Tens of times faster than a broadcast product.
+    return cv2.copyTo(rgb, mask.view(np.uint8), np.zeros_like(rgb))
