@@ -116,7 +116,7 @@ class FeatureSlamConfig:
     """Training-free target-relative motion."""
 
     max_points: int = option(200, "point tracks kept alive", low=16, high=2000)
-    spacing_px: float = option(4.0, "smallest distance between a new point and any other, px", low=1)
+    spacing_px: float = option(4.0, "least distance between a new point and any other, px", low=1)
     window_frames: int = option(14, "frames adjusted together, spread over the span", low=8, high=64)
     window_span_frames: int = option(60, "age at which a frame leaves the window", low=8, high=1000)
     iterations: int = option(4, "bundle adjustment steps per frame", low=1, high=50)
@@ -124,7 +124,8 @@ class FeatureSlamConfig:
     cutoff_px: float = option(1.0, "scale of the redescending loss on tracks, px", low=0.1)
     turn_acceleration_deg_s2: float = option(1.0, "standard deviation of the angular acceleration", low=1e-3)
     move_acceleration_radii_s2: float = option(0.5, "of the linear acceleration, in target radii", low=1e-3)
-    use_prior: bool = option(True, "let healthy priors bring CAD depth and rotation (needs prior.enabled)")
+    max_step_sigma_deg: float = option(1.0, "a step less certain than this is no motion", low=0.01)
+    use_prior: bool = option(True, "let healthy priors bring CAD depth and rotation (masked only; needs prior.enabled)")
     surface_sigma: float = option(0.03, "uncertainty of CAD depth, share of the target's bounding radius", low=1e-3)
     prior_turn_sigma_deg: float = option(0.3, "uncertainty of a fused rotation relative to others", low=0.01)
 

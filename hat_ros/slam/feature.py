@@ -51,7 +51,8 @@ class FeatureSlam:
         self._config = config.slam.feature
         self._masked = config.slam.masked
         self._delay_frames = config.prior.delay_frames
-        self._target = target if config.slam.feature.use_prior else None
+        # In a whole scene the target is a small part: its surface would say little, and pull at everything.
+        self._target = target if config.slam.feature.use_prior and self._masked else None
         self._epoch = 0
         self._camera: Camera | None = None
         self._forget()
@@ -194,6 +195,8 @@ class FeatureSlam:
         window = self._window
         T_slam_cam = lie.inverse(lie.transform(window.R_emitted[-1], window.t[-1]))
         sigma_rad = window.step_sigma_rad() if len(window) > 1 else 0.0
+        if not sigma_rad <= np.radians(self._config.max_step_sigma_deg):
+            return Motion.none(self._epoch, len(window))
         return Motion(True, self._epoch, lie.row_from_matrix(T_slam_cam), len(window), sigma_rad)
 
     def _normalise(self, xy: Float) -> Float:

@@ -24,6 +24,9 @@ _BACKWARD_TOLERANCE_PX = 0.4
 _CROP_PAD_PX = 32
 # Weakest corner accepted, as a share of the strongest (Shi and Tomasi's smaller eigenvalue).
 _CORNER_QUALITY = 0.004
+# Points keep apart by this share of what an even spread over the region would give: the strongest corners of a scene
+# crowd together, and a crowd says little about depth.
+_EVENNESS = 0.5
 # New corners are looked for once this share of the slots is free.
 _WORTHWHILE_SHARE = 0.05
 
@@ -33,7 +36,7 @@ class PointTracks:
 
     Args:
         n_slots: number of slots N.
-        spacing_px: smallest distance between a new point and any other.
+        spacing_px: least distance between a new point and any other; more where the region is large.
 
     Attributes:
         xy: (N, 2) pixel positions in the newest image.
@@ -72,7 +75,9 @@ class PointTracks:
         free = np.flatnonzero(~self.alive)
         if len(free) < _WORTHWHILE_SHARE * len(self.alive):
             return free[:0]
-        corners = detect(image, region, self.xy[self.alive], len(free), self._spacing_px)
+        even_px = np.sqrt(np.count_nonzero(region) / len(self.alive))
+        spacing_px = max(self._spacing_px, _EVENNESS * float(even_px))
+        corners = detect(image, region, self.xy[self.alive], len(free), spacing_px)
         slots = free[: len(corners)]
         self.xy[slots] = corners
         self.alive[slots] = True

@@ -41,7 +41,8 @@ _RIVAL_ITERATIONS = 8
 # it; it comes back when it costs less than this more. Right priors of 3 degrees noise stay at half the gain.
 _DISTRUST_GAIN, _DISTRUST_SHARE = 0.04, 0.7
 _TRUST_LOSS, _TRUST_SHARE = 0.03, 0.9
-_MIRROR = np.diag([1.0, 1.0, -1.0])
+# Nearest depth (units) that a reversed relief is made from.
+_MIN_MIRROR_DEPTH = 0.05
 
 
 class Window:
@@ -193,10 +194,12 @@ class Window:
         """
         k = len(self) // 2
         in_camera = self.points_in_camera(self.R[k], self.t[k])
-        center = np.median(in_camera[self.seen.any(axis=0)], axis=0)
-        X = ((in_camera - center) @ _MIRROR + center - self.t[k]) @ self.R[k]
-        R = np.ascontiguousarray(_MIRROR @ (self.R @ self.R[k].T) @ _MIRROR @ self.R[k])
-        t = self.t + (self.R - R) @ ((center - self.t[k]) @ self.R[k])
+        nearness = 1.0 / np.maximum(in_camera[:, 2], _MIN_MIRROR_DEPTH)
+        center = float(np.median(nearness[self.seen.any(axis=0)]))
+        # Reversed in inverse depth: to first order the motion of the image is linear in it.
+        z = 1.0 / np.clip(2.0 * center - nearness, 0.2 * center, 5.0 * center)
+        X = (in_camera * (z * nearness)[:, None] - self.t[k]) @ self.R[k]
+        R, t = self._poses_for(X, self.seen.any(axis=0), k)
         # Guesses were made in the spirit of the solution: they turn with it.
         problem = self._problem(False)._replace(X_expected=X.copy())
         cost, _ = self._descend((R, t, X), problem, _RIVAL_ITERATIONS)
@@ -222,21 +225,8 @@ class Window:
         """Take the structure that the prior suggests, and trust it, if it explains the tracks about as well."""
         known = self.n_looks > 0
         X = np.where(known[:, None], self.X_surface, self.X)
-        R, t = self.R.copy(), self.t.copy()
         first = int(np.argmin(np.abs(np.array(self.stamps_ns, dtype=np.int64) - self.look_stamp_ns)))
-        # Outwards from the frame of the look, each from its neighbour: the present poses may be far off.
-        for k in [*range(first, len(self)), *range(first - 1, -1, -1)]:
-            use = self.seen[k] & known
-            near = k if k == first else k - 1 if k > first else k + 1
-            if np.count_nonzero(use) < _MIN_SHARED_POINTS:
-                R[k], t[k] = R[near], t[near]
-                continue
-            for cutoff_px in (4 * _WIDE_CUTOFF_PX, _WIDE_CUTOFF_PX):
-                R[k], t[k], _ = refine_pose(
-                    R[near], t[near], X, self.xn[k], use, self.focal, self._config.sigma_px, cutoff_px, R[near],
-                    t[near], 1.0, 1.0, 6,
-                )  # fmt: skip
-                near = k
+        R, t = self._poses_for(X, known, first)
         self._descend((R, t, X), self._problem(True)._replace(R_info=np.zeros(len(self))), _RIVAL_ITERATIONS)
         free = self._problem(False)
         present = window_cost(self.R, self.t, self.X, free)
@@ -277,6 +267,25 @@ class Window:
         J = np.zeros((3, 12))
         J[:, :3], J[:, 6:9] = -A, np.eye(3)
         return float(np.sqrt(np.trace(J @ self.covariance @ J.T)))
+
+    def _poses_for(self, X: Float, known: Bool, first: int) -> tuple[Float, Float]:
+        """Poses (W, 3, 3), (W, 3) of all frames from other points (N, 3), those that are known.
+
+        Outwards from a frame whose pose is kept as a start, each from its neighbour: the present poses may be far off.
+        """
+        R, t = self.R.copy(), self.t.copy()
+        for k in [*range(first, len(self)), *range(first - 1, -1, -1)]:
+            use = self.seen[k] & known
+            near = k if k == first else k - 1 if k > first else k + 1
+            R[k], t[k] = R[near], t[near]
+            if np.count_nonzero(use) < _MIN_SHARED_POINTS:
+                continue
+            for cutoff_px in (4 * _WIDE_CUTOFF_PX, _WIDE_CUTOFF_PX):
+                R[k], t[k], _ = refine_pose(
+                    R[k], t[k], X, self.xn[k], use, self.focal, self._config.sigma_px, cutoff_px, R[k], t[k],
+                    1.0, 1.0, 6,
+                )  # fmt: skip
+        return R, t
 
     def _descend(self, state: tuple[Float, Float, Float], problem: Problem, n_iterations: int) -> tuple[float, Float]:
         R, t, X = state

@@ -43,7 +43,8 @@ def motions_with_prior(clip):
 
 
 def test_planted_motion_is_recovered_up_to_similarity(clip, motions):
-    assert all(motion.valid for motion in motions)
+    assert motions[0].valid
+    assert all(motion.valid for motion in motions[5:])
     assert {motion.epoch for motion in motions} == {0}
     assert np.median(turn_errors_deg(motions, clip.T_cam_target)[20:]) < 0.1
     assert np.median(turn_errors_deg(motions, clip.T_cam_target, step=10)[20:]) < 1.0
@@ -64,10 +65,16 @@ def test_camera_keeps_its_place_in_the_target_frame(clip, motions_with_prior):
 
 
 def test_uncertainty_is_finite_and_falls_as_structure_emerges(motions):
-    sigma = np.array([motion.sigma_rad for motion in motions[1:]])
+    sigma = np.array([motion.sigma_rad for motion in motions if motion.valid][1:])
     assert np.isfinite(sigma).all()
     assert (sigma > 0).all()
-    assert np.median(sigma[20:]) < 0.5 * sigma[0]
+    assert np.median(sigma[20:]) < 0.7 * sigma[0]
+
+
+def test_an_uncertain_step_is_no_motion(clip, motions):
+    strict = run(FeatureSlam(config(max_step_sigma_deg=0.05), None), clip, last=10)
+    assert not any(motion.valid for motion in strict[1:])
+    assert strict[-1].epoch == motions[9].epoch
 
 
 def test_a_later_frame_or_prior_never_changes_an_earlier_output(clip, motions_with_prior):
@@ -159,13 +166,22 @@ def test_a_bright_background_outside_the_mask_does_not_leak(clip):
     assert np.median(turn_errors_deg(found, cloudy.T_cam_target)[12:]) < 0.1
 
 
-def test_a_static_scene_needs_no_mask():
-    """Everything moves with the target when its backdrop is painted on a wall behind it: here, no backdrop at all."""
-    still = speckled_clip(25, step_deg=1.0)
+@pytest.fixture(scope="module")
+def scene():
+    return speckled_clip(30, wall=True, step_deg=1.0)
+
+
+def test_a_static_scene_needs_neither_mask_nor_detection(scene):
     slam = FeatureSlam(config(masked=False), None)
-    found = [slam.update(frame, None, None) for frame in still.frames]
-    assert all(motion.valid for motion in found)
-    assert np.median(turn_errors_deg(found, still.T_cam_target)[12:]) < 0.3
+    found = [slam.update(frame, None, None) for frame in scene.frames]
+    assert all(motion.valid for motion in found[5:])
+    assert np.nanmedian(turn_errors_deg(found, scene.T_cam_target)[12:]) < 0.1
+
+
+def test_priors_of_a_small_part_are_not_used_on_a_whole_scene(scene):
+    with_prior = run(FeatureSlam(config(masked=False), scene.target), scene, scene.prior, last=12)
+    without = run(FeatureSlam(config(masked=False), None), scene, last=12)
+    assert [a.pose_row.tobytes() for a in with_prior] == [b.pose_row.tobytes() for b in without]
 
 
 def test_a_stretch_of_strange_masks_is_survived(clip):
@@ -195,7 +211,7 @@ def test_memory_does_not_grow(clip):
             slam.update(Frame(stamp_ns, clip.frames[i].rgb, CAMERA), clip.detections[i], None)
         held.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
-    assert max(held[8:]) < 1.1 * max(held[2:8])
+    assert max(held[8:]) < max(held[2:8]) + 64_000
 
 
 def test_bulge_is_highest_in_the_middle_and_low_at_the_edge():

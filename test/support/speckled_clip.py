@@ -44,6 +44,15 @@ def turning_poses(n_frames, step_deg=1.5, range_m=5.0, seed=1):
     return lie.transform(turns @ R, t + [0, 0, range_m])
 
 
+def painted_wall(T_first, T_cam_target, rays):
+    """(H, W) grey of a plane fixed in the target frame, 1.5 m behind its origin as the first camera sees it."""
+    normal = T_first[2, :3]
+    R, t = T_cam_target[:3, :3], T_cam_target[:3, 3]
+    origin, directions = -t @ R, rays @ R
+    points = origin + directions * ((1.5 - origin @ normal) / (directions @ normal))[..., None]
+    return paint(points.reshape(-1, 3) * 0.6).reshape(rays.shape[:2])
+
+
 @dataclass
 class SpeckledClip:
     """Frames, detections and the truth."""
@@ -65,8 +74,9 @@ class SpeckledClip:
         return PosePrior(self.frames[past].stamp_ns, row, row, healthy)
 
 
-def speckled_clip(n_frames, backdrop=False, **motion):
-    """Render a clip; ``backdrop`` adds a bright texture behind the target that moves on its own."""
+def speckled_clip(n_frames, backdrop=False, wall=False, **motion):
+    """Render a clip; ``backdrop`` adds a bright texture behind the target that moves on its own, ``wall`` one that is
+    fixed to the target."""
     target, poses = model(), turning_poses(n_frames, **motion)
     renderer, rng = EmbreeRenderer(target), np.random.default_rng(3)
     clouds = cv2.GaussianBlur(rng.uniform(0, 255, (600, 900)), (0, 0), 3)
@@ -78,6 +88,8 @@ def speckled_clip(n_frames, backdrop=False, **motion):
         drawn = renderer.render(T, CAMERA, color=False)
         points = rays[drawn.mask] * drawn.depth_m[drawn.mask][:, None]
         grey = clouds[2 * i : 2 * i + 240, 5 * i : 5 * i + 320].copy() if backdrop else np.zeros(drawn.mask.shape)
+        if wall:
+            grey = painted_wall(poses[0], T, rays)
         grey[drawn.mask] = paint((points - T[:3, 3]) @ T[:3, :3])
         grey = np.clip(cv2.GaussianBlur(grey, (0, 0), 0.6) + rng.normal(0, 1.5, grey.shape), 0, 255).astype(np.uint8)
         frames.append(Frame((i + 1) * FRAME_NS, np.repeat(grey[..., None], 3, axis=2), CAMERA))
