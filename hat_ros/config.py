@@ -119,7 +119,7 @@ class FeatureSlamConfig:
     spacing_px: float = option(4.0, "least distance between a new point and any other, px", low=1)
     window_frames: int = option(14, "frames adjusted together, spread over the span", low=8, high=64)
     window_span_frames: int = option(60, "age at which a frame leaves the window", low=8, high=1000)
-    iterations: int = option(4, "bundle adjustment steps per frame", low=1, high=50)
+    iterations: int = option(3, "bundle adjustment steps per frame", low=1, high=50)
     sigma_px: float = option(1.0, "standard deviation of a track: errors persist, so more than its jitter", low=0.01)
     cutoff_px: float = option(1.0, "scale of the redescending loss on tracks, px", low=0.1)
     turn_acceleration_deg_s2: float = option(1.0, "standard deviation of the angular acceleration", low=1e-3)
