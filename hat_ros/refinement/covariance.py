@@ -11,8 +11,30 @@ from numpy.typing import NDArray
 
 from hat_ros.refinement.refiner import Fit
 
+# Systematic error of an outline: a threshold at half level, a glow or a fillet each move it by part of a pixel.
+OUTLINE_SIGMA_PX = 0.25
 # Uncertainty of a direction without any evidence, in units of the mean: large but finite.
 _WEAKEST = 1e-4
+
+
+def outline_floor(T_cam_target: NDArray[np.float64], focal_px: float, radius_m: float) -> NDArray[np.float64]:
+    """(6, 6) what exposure, blur and the CAD model do to an outline, which no residual of one image shows.
+
+    An outline that is ``OUTLINE_SIGMA_PX`` too wide all around is a depth error of that share of the target's apparent
+    radius; shifted by as much it is a lateral error, twisted a rotation.
+
+    Args:
+        T_cam_target: (4, 4) pose. focal_px: focal length. radius_m: bounding radius of the target.
+    """
+    position = T_cam_target[:3, 3]
+    range_m = float(np.linalg.norm(position))
+    lateral_m = OUTLINE_SIGMA_PX * range_m / focal_px
+    depth_m = lateral_m * range_m / radius_m
+    sight = position / range_m
+    floor = np.zeros((6, 6))
+    floor[:3, :3] = lateral_m**2 * np.eye(3) + depth_m**2 * np.outer(sight, sight)
+    floor[3:, 3:] = (lateral_m / radius_m) ** 2 * np.eye(3)
+    return floor
 
 
 def pose_covariance(fit: Fit, radius_m: float) -> NDArray[np.float64] | None:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from hat_ros import lie
 from hat_ros.config import RefinementConfig
-from hat_ros.refinement.covariance import pose_covariance
+from hat_ros.refinement.covariance import outline_floor, pose_covariance
 from hat_ros.refinement.refiner import WITH_MASK, WITHOUT_MASK, PoseFitter
 from hat_ros.refinement.view import MaskField, TargetViewer
 from hat_ros.target import Target
@@ -59,6 +59,8 @@ class FusedPoseRefiner:
         covariance = pose_covariance(fit, self._target.bounding_radius_m)
         if covariance is None:
             return None
+        focal_px = float(frame.camera.K[0, 0])
+        covariance = covariance + outline_floor(fit.T_cam_target, focal_px, self._target.bounding_radius_m)
         # The last round starts where the one before it converged: its view is the result's but for part of a pixel.
         overlap = visible_overlap = float("nan")
         if field is not None:
