@@ -51,7 +51,8 @@ class DroidSlam:
         self._device = choose_device(self._config.device)
         self._model = model or DroidNet.from_checkpoint(
             config.nets.weights_folder or None,
-            device=self._device, autocast=choose_precision(self._config.precision, self._device)
+            device=self._device,
+            autocast=choose_precision(self._config.precision, self._device),
         )
         self._frontend: DroidFrontend | None = None
         self._camera: Camera | None = None
