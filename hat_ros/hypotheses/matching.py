@@ -148,7 +148,7 @@ def _correlate(bank: ViewBank, grids: NDArray[np.float32]) -> NDArray[np.float32
     return np.fft.irfft(product, n=bank.n_angles, axis=2).astype(np.float32)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _cross_spectrum(
     views: NDArray[np.complex64], real: NDArray[np.float32], imag: NDArray[np.float32]
 ) -> NDArray[np.complex64]:

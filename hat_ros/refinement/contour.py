@@ -40,7 +40,7 @@ def contour_table(
     return _contour_table(np.ascontiguousarray(depth_m), silhouette, blurred, K_crop, max_points)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _count_cracks(silhouette: NDArray[np.bool_]) -> int:
     h, w = silhouette.shape
     count = 0
@@ -54,7 +54,7 @@ def _count_cracks(silhouette: NDArray[np.bool_]) -> int:
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _free_distance(silhouette: NDArray[np.bool_], u: float, v: float, du: float, dv: float, inside: bool) -> int:
     """Steps of one pixel along (du, dv) that stay inside (or outside) the silhouette."""
     h, w = silhouette.shape
@@ -68,7 +68,7 @@ def _free_distance(silhouette: NDArray[np.bool_], u: float, v: float, du: float,
     return MAX_FREE_PX
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _contour_table(
     depth_m: NDArray[np.float32],
     silhouette: NDArray[np.bool_],

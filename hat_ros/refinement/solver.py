@@ -34,7 +34,7 @@ N_PARAMETERS = 8
 MASK_BIAS, EDGE_BIAS = 6, 7
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def cholesky_solve(A: Array, b: Array) -> tuple[bool, Array]:
     """Solve the symmetric positive definite system ``A x = b`` of any small size; False when A is not."""
     n = A.shape[0]
@@ -64,7 +64,7 @@ def cholesky_solve(A: Array, b: Array) -> tuple[bool, Array]:
     return True, x
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def rotation_exp(r: Array) -> Array:
     """(3, 3) rotation of a rotation vector (Rodrigues)."""
     angle_sq = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
@@ -85,7 +85,7 @@ def rotation_exp(r: Array) -> Array:
     return R
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _update_pose(R: Array, t: Array, step: Array) -> tuple[Array, Array]:
     dR = rotation_exp(step[3:6])
     out = np.zeros((3, 3))
@@ -96,7 +96,7 @@ def _update_pose(R: Array, t: Array, step: Array) -> tuple[Array, Array]:
     return out, t + step[:3]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _normal_row(
     x: float,
     y: float,
@@ -121,7 +121,7 @@ def _normal_row(
     row[5] = rx * gy - ry * gx
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _accumulate(H: Array, g: Array, row: Array, weight: float, residual: float) -> None:
     """Add one weighted residual with derivative row to the normal equations (lower triangle)."""
     for i in range(len(row)):
@@ -130,7 +130,7 @@ def _accumulate(H: Array, g: Array, row: Array, weight: float, residual: float) 
             H[i, j] += weight * row[i] * row[j]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _damped_solve(H: Array, g: Array, damping: float, radius_m: float) -> tuple[bool, Array]:
     """Step of the pose and the biases; damping is a share of the mean translational information."""
     n = len(g)
@@ -146,7 +146,7 @@ def _damped_solve(H: Array, g: Array, damping: float, radius_m: float) -> tuple[
     return cholesky_solve(A, g)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _mask_distance(distance: NDArray[np.float32], a: float, b: float, out: Array) -> None:
     """Bilinear signed distance and its gradient at crop position (a, b), into out (3,)."""
     h, w = distance.shape
@@ -160,7 +160,7 @@ def _mask_distance(distance: NDArray[np.float32], a: float, b: float, out: Array
     out[2] = (d01 - d00) * (1 - fa) + (d11 - d10) * fa
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _sample(image: NDArray[np.uint8], u: float, v: float, out: Array) -> None:
     """Bilinear colour at (u, v), which must lie inside the image."""
     iu, iv = int(u), int(v)
@@ -171,7 +171,7 @@ def _sample(image: NDArray[np.uint8], u: float, v: float, out: Array) -> None:
         out[c] = top * (1 - fv) + bottom * fv
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def edge_offset(
     image: NDArray[np.uint8],
     u: float,
@@ -234,13 +234,13 @@ def edge_offset(
     return best, 1.0 / (1.0 + scatter / SCATTER_REF + noise)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _mean_square(total: float, weight: float, floor: float) -> float:
     """Weighted mean square residual, not below floor."""
     return max(total / weight, floor) if weight > 0.0 else floor
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def fit_contour(
     points: Array,
     lines: Array,

@@ -206,7 +206,7 @@ class MaskField:
         return float(self._depth_counts @ np.clip(centers - depth_px, 0.0, 1.0))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def silhouette_areas(
     silhouette: NDArray[np.bool_],
     distance: NDArray[np.float32],

@@ -34,7 +34,7 @@ def refine_outline(rgb: NDArray[np.uint8], mask: NDArray[np.uint8], band_px: int
     return np.where(inner == outer, mask, smooth)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _decide(rgb, mask, inner, outer, window, contrast_sq):  # noqa: ANN001, ANN202 - compiled
     h, w = mask.shape
     out = mask.copy()

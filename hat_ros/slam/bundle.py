@@ -66,7 +66,7 @@ class Problem(NamedTuple):
     gauge_info: float
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def rotation(v: Float) -> Float:
     """Rotation matrix (3, 3) of a rotation vector (3,) in radians."""
     s = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
@@ -83,7 +83,7 @@ def rotation(v: Float) -> Float:
     return R
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def product(A: Float, B: Float) -> Float:
     """Matrix product of two (3, 3)."""
     C = np.empty((3, 3))
@@ -93,7 +93,7 @@ def product(A: Float, B: Float) -> Float:
     return C
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def turn_between(R_b: Float, R_a: Float) -> Float:
     """Rotation vector (3,) of ``R_b R_a^T``, for angles below 180 degrees."""
     D = np.empty((3, 3))
@@ -108,7 +108,7 @@ def turn_between(R_b: Float, R_a: Float) -> Float:
     return v
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def cholesky_in_place(A: Float) -> bool:
     """Lower factor of a symmetric matrix, read from and written to its lower triangle; False if not definite."""
     for j in range(A.shape[0]):
@@ -125,7 +125,7 @@ def cholesky_in_place(A: Float) -> bool:
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def cholesky_solve(L: Float, b: Float) -> Float:
     """Solution of ``L L^T x = b``."""
     n = L.shape[0]
@@ -141,7 +141,7 @@ def cholesky_solve(L: Float, b: Float) -> Float:
     return x
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _observe(R: Float, t: Float, X: Float, xn: Float, focal: float, r: Float, J_pose: Float, J_point: Float) -> bool:
     """Residual (2,) px and its Jacobians (2, 6), (2, 3); False when the point is behind the camera."""
     rx = R[0, 0] * X[0] + R[0, 1] * X[1] + R[0, 2] * X[2]
@@ -163,20 +163,20 @@ def _observe(R: Float, t: Float, X: Float, xn: Float, focal: float, r: Float, J_
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _loss(error_sq: float, cutoff_sq: float) -> float:
     """Geman-McClure: the square near zero, ``cutoff_sq`` far away."""
     return cutoff_sq * error_sq / (cutoff_sq + error_sq)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _weight(error_sq: float, cutoff_sq: float) -> float:
     """Weight of the square that has the same gradient as :func:`_loss`."""
     q = cutoff_sq / (cutoff_sq + error_sq)
     return q * q
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def refine_pose(
     R: Float, t: Float, X: Float, xn: Float, use: Bool, focal: float, sigma_px: float, cutoff_px: float,
     R_expected: Float, t_expected: Float, turn_info: float, move_info: float, n_iterations: int,
@@ -225,7 +225,7 @@ def refine_pose(
     return R, t, residual
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def window_cost(R: Float, t: Float, X: Float, p: Problem) -> float:
     """Value of the cost (module text) at a state (W, 3, 3), (W, 3), (N, 3)."""
     W, N = p.seen.shape
@@ -264,7 +264,7 @@ def window_cost(R: Float, t: Float, X: Float, p: Problem) -> float:
     return cost
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _add_rate_terms(S: Float, g: Float, R: Float, t: Float, p: Problem) -> None:
     """Constant-rate prior: adds to the lower triangle of S (6W, 6W) and to the descent direction g (6W,)."""
     J = np.empty((3, 3, 3))
@@ -294,7 +294,7 @@ def _add_rate_terms(S: Float, g: Float, R: Float, t: Float, p: Problem) -> None:
                         S[row + b, col + d] += w_turn * s
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _add_pose_terms(S: Float, g: Float, R: Float, t: Float, p: Problem) -> None:
     """Expected rotations and the gauge."""
     for k in range(len(R)):
@@ -313,7 +313,7 @@ def _add_pose_terms(S: Float, g: Float, R: Float, t: Float, p: Problem) -> None:
         g[a + 3] -= p.gauge_info * (t[0, a] - p.t_gauge[a])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _add_observations(
     i: int, S: Float, g: Float, V: Float, b: Float, C: Float, R: Float, t: Float, X: Float, p: Problem
 ) -> bool:
@@ -352,7 +352,7 @@ def _add_observations(
     return any_seen
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _eliminate(i: int, S: Float, g: Float, L: Float, b: Float, C: Float, Y: Float, p: Problem) -> None:
     """Schur complement of point i, its block already factored as L L^T: S -= Y^T Y, g -= Y^T L^-1 b, Y = L^-1 C^T."""
     y0 = b[0] / L[0, 0]
@@ -375,7 +375,7 @@ def _eliminate(i: int, S: Float, g: Float, L: Float, b: Float, C: Float, Y: Floa
                 S[row, col] -= v0 * Y[0, col] + v1 * Y[1, col] + v2 * Y[2, col]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _step_points(X: Float, step: Float, V: Float, b: Float, C: Float, solved: Bool, p: Problem) -> Float:
     """Points after a step (6W,) of the poses: back-substitution."""
     X_new = X.copy()
@@ -392,7 +392,7 @@ def _step_points(X: Float, step: Float, V: Float, b: Float, C: Float, solved: Bo
     return X_new
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def adjust_window(R: Float, t: Float, X: Float, p: Problem, n_iterations: int) -> tuple[float, Float]:
     """Minimise the cost in place.
 
