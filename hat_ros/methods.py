@@ -44,6 +44,9 @@ class Method(Protocol):
     causal: bool
     """Whether ``step`` gives the final answer; if not, :meth:`finish` does."""
 
+    concurrent: bool
+    """Whether steps of several frames may overlap by the rules of :mod:`hat_ros.turnstile`."""
+
     stages: dict[str, Any]
     """Stage name -> the object whose ``update`` is that stage; for timing."""
 
@@ -80,6 +83,7 @@ class Hat:
     """The method of the paper, as :class:`HatTracker` runs it."""
 
     causal = True
+    concurrent = True
 
     def __init__(self, config: HatConfig, target: Target) -> None:
         self._tracker = HatTracker(config, target)
@@ -101,6 +105,7 @@ class Independent:
     """Every frame for itself: its best-scored hypothesis, or no pose."""
 
     causal = True
+    concurrent = True
 
     def __init__(self, config: HatConfig, target: Target) -> None:
         config = replace(config, keyframes=replace(config.keyframes, gap_frames=1))
@@ -123,6 +128,7 @@ class Tracking:
     """The previous pose, refined on each image; the best appearance where there is no track to follow."""
 
     causal = True
+    concurrent = False  # a step follows the pose of the one before
 
     def __init__(self, config: HatConfig, target: Target) -> None:
         config = replace(
@@ -180,6 +186,7 @@ class Observe:
     """What the front ends see when nobody asks for a pose: candidates at every frame, motion, no priors."""
 
     causal = True
+    concurrent = True
 
     def __init__(self, config: HatConfig, target: Target) -> None:
         config = replace(config, keyframes=replace(config.keyframes, gap_frames=1))
@@ -191,8 +198,8 @@ class Observe:
     def step(self, frame: Frame) -> Step:
         """Look, and say nothing."""
         detection = self._segmentation.update(frame, None)
-        candidates = self._hypotheses.update(frame, detection, None)
         motion = self._motion.update(frame, detection, None)
+        candidates = self._hypotheses.update(frame, detection, None)
         nothing = Estimate(
             frame.stamp_ns,
             TrackState.UNINITIALISED,
@@ -213,6 +220,7 @@ class Offline:
     """What hindsight makes of the observations of HAT (paper, "Causal and Offline Performance Comparison")."""
 
     causal = False
+    concurrent = False
 
     def __init__(self, config: HatConfig, target: Target) -> None:
         self._config = config

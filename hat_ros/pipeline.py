@@ -1,4 +1,4 @@
-"""A method run over a recording in this process: admission, timing, progress. No ROS.
+"""A method run over a recording in this process: admission, frames in flight, timing. No ROS.
 
 The stages are the ones that the graph's nodes own, and frames are admitted by the same rule, so both give the same
 bytes. Clocks are read here, never inside a stage.
@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import resource
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -20,10 +21,19 @@ from hat_ros.errors import FrameError
 from hat_ros.evaluation.metrics import mask_iou
 from hat_ros.methods import Method
 from hat_ros.tracker import Step
+from hat_ros.turnstile import Turnstiles
 from hat_ros.types import Frame
 
 STAGE_NAMES = ("segmentation", "hypotheses", "motion", "selector", "fusion")
-MEASURED = ("latency_ms", "cpu_ms", "decode_ms", *(f"{name}_ms" for name in STAGE_NAMES), "rss_mib", "mask_iou")
+MEASURED = (
+    "latency_ms",
+    "period_ms",
+    "cpu_ms",
+    "decode_ms",
+    *(f"{name}_ms" for name in STAGE_NAMES),
+    "rss_mib",
+    "mask_iou",
+)
 # First frames left out of throughput and latency: compiled code is loaded and caches are filled there.
 WARMUP_FRAMES = 10
 
@@ -35,65 +45,53 @@ class Processed:
     Attributes:
         frame: the frame as recorded, given mask included.
         step: what the stages said.
-        latency_ms: wall time of the step.
-        cpu_ms: processor time of the step, all threads together.
-        decode_ms: wall time of reading and decoding the frame before it.
-        stage_ms: wall time by stage.
+        latency_ms: wall time from admission to the answer, waiting behind frames in flight included.
+        decode_ms: wall time of reading and decoding the frame before that.
+        stage_ms: wall time by stage, waiting left out.
         rss_mib: resident memory of this process after the step.
         mask_iou: overlap of the detected and the recorded silhouette, NaN when none was recorded.
+        period_ms: wall time from the previous answer, or the start, to this one.
+        cpu_ms: processor time of the whole process in that period.
     """
 
     frame: Frame
     step: Step
     latency_ms: float
-    cpu_ms: float
     decode_ms: float
     stage_ms: dict[str, float]
     rss_mib: float
     mask_iou: float
+    period_ms: float = float("nan")
+    cpu_ms: float = float("nan")
 
     def measured(self) -> tuple[float, ...]:
         """The values of :data:`MEASURED`, in order."""
-        return (self.latency_ms, self.cpu_ms, self.decode_ms, *self.stage_ms.values(), self.rss_mib, self.mask_iou)
-
-
-class StageClock:
-    """Measures each stage of a method from outside, by wrapping the stage objects' ``update``."""
-
-    def __init__(self, method: Method) -> None:
-        self._stage_ms = dict.fromkeys(STAGE_NAMES, 0.0)
-        for name, stage in method.stages.items():
-            stage.update = self._timed(name, stage.update)
-
-    def _timed(self, name: str, update: Callable[..., Any]) -> Callable[..., Any]:
-        def timed(*args: Any) -> Any:
-            start = time.perf_counter()
-            try:
-                return update(*args)
-            finally:
-                self._stage_ms[name] += 1e3 * (time.perf_counter() - start)
-
-        return timed
-
-    def take(self) -> dict[str, float]:
-        """Milliseconds since the last call, by stage."""
-        taken, self._stage_ms = self._stage_ms, dict.fromkeys(STAGE_NAMES, 0.0)
-        return taken
+        return (
+            self.latency_ms,
+            self.period_ms,
+            self.cpu_ms,
+            self.decode_ms,
+            *self.stage_ms.values(),
+            self.rss_mib,
+            self.mask_iou,
+        )
 
 
 class Pipeline:
-    """Feeds frames to a method, one at a time.
+    """Feeds the frames of one run to a method.
 
     Args:
         method: what estimates the poses.
         masks_given: hand the recorded masks to the method; otherwise they only serve to judge its own.
+        credits: W, frames in flight at once, each in a thread; the answers do not depend on it.
     """
 
-    def __init__(self, method: Method, masks_given: bool) -> None:
+    def __init__(self, method: Method, masks_given: bool, credits: int = 1) -> None:
         self._method = method
         self._masks_given = masks_given
-        self._clock = StageClock(method)
-        self._admission = Admission(credits=1)
+        self._credits = credits if method.concurrent else 1
+        self._turnstiles = Turnstiles(method.stages)
+        self._admission = Admission(self._credits)
         self.rejected = 0
 
     @property
@@ -102,37 +100,67 @@ class Pipeline:
         return self._method.causal
 
     def run(self, frames: Iterable[Frame | FrameError]) -> Iterator[Processed]:
-        """Process frames in order; those with a late stamp or malformed are counted in ``rejected``."""
-        iterator = iter(frames)
-        while True:
-            start = time.perf_counter()
-            frame = next(iterator, None)
-            if frame is None:
-                return
+        """Process frames, answers in order; those with a late stamp or malformed are counted in ``rejected``."""
+        admitted = self._admitted(iter(frames))
+        in_flight: deque[Future[Processed]] = deque()
+        clock = _Clock()
+        with ThreadPoolExecutor(self._credits, "frame") as threads:
             try:
-                if isinstance(frame, FrameError):
-                    raise frame
-                self._admission.admit(frame.stamp_ns)
-            except FrameError:
-                self.rejected += 1
-                continue
-            yield self._process(frame, 1e3 * (time.perf_counter() - start))
-            self._admission.answered(frame.stamp_ns)
+                while True:
+                    while self._admission.has_credit and (entry := next(admitted, None)) is not None:
+                        in_flight.append(threads.submit(self._process, *entry))
+                    if not in_flight:
+                        return
+                    done = in_flight.popleft().result()
+                    self._admission.answered(done.frame.stamp_ns)
+                    yield replace(done, **clock.lap())
+            finally:
+                self._turnstiles.close(0)
 
     def finish(self, steps: list[Step]) -> list[Step]:
         """The collected steps with the answers of a method that gives them only after the last frame."""
         return [replace(step, estimate=final) for step, final in zip(steps, self._method.finish(), strict=True)]
 
-    def _process(self, frame: Frame, decode_ms: float) -> Processed:
+    def _admitted(self, frames: Iterator[Frame | FrameError]) -> Iterator[tuple[int, Frame, float]]:
+        """Sequence number, frame and decoding time of the frames that may enter; asked only when there is credit."""
+        while True:
+            start = time.perf_counter()
+            frame = next(frames, None)
+            if frame is None:
+                return
+            try:
+                if isinstance(frame, FrameError):
+                    raise frame
+                seq = self._admission.admit(frame.stamp_ns)
+            except FrameError:
+                self.rejected += 1
+                continue
+            yield seq, frame, 1e3 * (time.perf_counter() - start)
+
+    def _process(self, seq: int, frame: Frame, decode_ms: float) -> Processed:
         seen = frame if self._masks_given else replace(frame, given_mask=None)
-        start, start_cpu = time.perf_counter(), time.process_time()
-        step = self._method.step(seen)
-        latency_ms, cpu_ms = 1e3 * (time.perf_counter() - start), 1e3 * (time.process_time() - start_cpu)
-        stage_ms, iou = self._clock.take(), float("nan")
-        looked = step.detection is not None or stage_ms["segmentation"] > 0
+        start = time.perf_counter()
+        with self._turnstiles.frame(seq) as stage_ms:
+            step = self._method.step(seen)
+        latency_ms, iou = 1e3 * (time.perf_counter() - start), float("nan")
+        looked = step.detection is not None or "segmentation" in stage_ms
         if looked and frame.given_mask is not None and (silhouette := frame.given_mask == 255).any():
             iou = mask_iou(None if step.detection is None else step.detection.mask, silhouette)
-        return Processed(frame, step, latency_ms, cpu_ms, decode_ms, stage_ms, resident_mib(), iou)
+        stage_ms = {name: stage_ms.get(name, 0.0) for name in STAGE_NAMES}
+        return Processed(frame, step, latency_ms, decode_ms, stage_ms, resident_mib(), iou)
+
+
+class _Clock:
+    """Wall and processor time between answers."""
+
+    def __init__(self) -> None:
+        self._last = time.perf_counter(), time.process_time()
+
+    def lap(self) -> dict[str, float]:
+        now = time.perf_counter(), time.process_time()
+        wall_s, cpu_s = (b - a for a, b in zip(self._last, now, strict=True))
+        self._last = now
+        return {"period_ms": 1e3 * wall_s, "cpu_ms": 1e3 * cpu_s}
 
 
 def resident_mib() -> float:
@@ -158,15 +186,14 @@ def memory_summary(rows: list[tuple[float, ...]]) -> dict[str, float]:
 def latency_summary(rows: list[tuple[float, ...]]) -> dict[str, float]:
     """Throughput, latency percentiles and mean time per stage over rows of :data:`MEASURED`, after warm-up.
 
-    Throughput counts decoding and the method, not the writing of results.
+    Throughput counts everything that is done while the recording runs: decoding, the method, writing of results.
     """
     table = np.array(rows[WARMUP_FRAMES:] or rows, dtype=np.float64).reshape(-1, len(MEASURED))
     if not len(table):
         return {"fps": float("nan"), "latency_ms_p50": float("nan"), "latency_ms_p99": float("nan")}
     column = dict(zip(MEASURED, table.T, strict=True))
-    busy_ms = column["latency_ms"] + column["decode_ms"]
     return {
-        "fps": float(1e3 * len(table) / busy_ms.sum()),
+        "fps": float(1e3 * len(table) / column["period_ms"].sum()),
         "latency_ms_p50": float(np.percentile(column["latency_ms"], 50)),
         "latency_ms_p99": float(np.percentile(column["latency_ms"], 99)),
         "latency_ms_max": float(column["latency_ms"].max()),

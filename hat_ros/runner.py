@@ -6,7 +6,7 @@ import resource
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,12 +44,14 @@ class TrackOptions:
         mode: ``hat``, ``independent``, ``tracking`` or ``offline``.
         start: frames skipped at the beginning (a cold start later in the clip).
         limit: at most this many frames, None = all.
+        credits: W, frames in flight, each in a thread; None = the configuration's.
         video: write the overlay video.
         report: write ``report.html``.
         overwrite: replace a finished result folder.
     """
 
     mode: str = "hat"
+    credits: int | None = None
     start: int = 0
     limit: int | None = None
     video: bool = True
@@ -74,12 +76,14 @@ def track(spec: SourceSpec, out: Path, config: HatConfig, options: TrackOptions,
         InputError: the recording, the CAD model, the configuration or ``out`` is bad.
         RunError: the run stopped half-way; what was done is in ``<out>.partial``.
     """
+    if options.credits is not None:
+        config = replace(config, graph=replace(config.graph, credits_replay=options.credits))
     folder = ResultFolder(out, options.overwrite)
     source = spec.open()
     if source.count(options.start, options.limit) == 0:
         raise UsageError(f"{spec.path} has {source.count()} frames, --start {options.start} leaves none")
     method = create_method(options.mode, config, source.target)
-    pipeline = Pipeline(method, config.segmentation.backend in GIVEN_MASK_BACKENDS)
+    pipeline = Pipeline(method, config.segmentation.backend in GIVEN_MASK_BACKENDS, config.graph.credits_replay)
     how = {"mode": options.mode, "start": options.start, "limit": options.limit}
     with _result_folder(folder, spec, config, how):
         measured = _run(pipeline, source, folder, options, watch)

@@ -51,8 +51,8 @@ class HatTracker:
         """Process one frame, stamps strictly increasing; nothing returned earlier is ever revised."""
         prior = self.priors.before(frame.stamp_ns)  # fused poses of frame t - delay and earlier
         detection = self.segmentation.update(frame, prior)  # Stage 1
-        candidates = self.hypotheses.update(frame, detection, prior)  # Stage 2, keyframes only
         motion = self.motion.update(frame, detection, prior)  # target-relative SLAM
+        candidates = self.hypotheses.update(frame, detection, prior)  # Stage 2, keyframes only; long, so after motion
         selection = self.selector.update(candidates, motion)  # Stage 3
         estimate = self.fusion.update(frame, detection, motion, selection)  # Stage 4
         self.priors.push(estimate)

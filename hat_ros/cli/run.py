@@ -43,9 +43,7 @@ def _add_replay(commands: Commands) -> None:
         default="processes",
         help="five processes, or all nodes in one (default: processes)",
     )
-    parser.add_argument(
-        "--credits", type=positive, metavar="W", help="frames in flight (default: graph.credits_replay)"
-    )
+    _add_credits(parser)
     parser.add_argument("--live", action="store_true", help="play in real time; frames are dropped, not queued")
     parser.add_argument("--rate", type=float, default=1.0, metavar="X", help="speed of --live play (default: 1)")
     parser.add_argument(
@@ -56,6 +54,15 @@ def _add_replay(commands: Commands) -> None:
     )
     _add_common(parser)
     parser.set_defaults(command=_replay)
+
+
+def _add_credits(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--credits",
+        type=positive,
+        metavar="W",
+        help="frames in flight; the poses do not depend on it (default: graph.credits_replay)",
+    )
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
@@ -110,6 +117,7 @@ def _add_track(commands: Commands) -> None:
         "observe: front ends only, candidates at every frame, no poses "
         "(default: hat)",
     )
+    _add_credits(parser)
     _add_common(parser)
     add_threads(parser)
     parser.set_defaults(command=_track)
@@ -127,6 +135,7 @@ def _track(arguments: argparse.Namespace) -> int:
     spec = SourceSpec(arguments.recording, arguments.dataset, arguments.sequence, arguments.model)
     options = TrackOptions(
         mode=arguments.mode,
+        credits=arguments.credits,
         start=arguments.start,
         limit=arguments.limit,
         video=not arguments.no_video,

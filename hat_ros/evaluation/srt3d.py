@@ -237,6 +237,7 @@ class Srt3d:
     """The tracker as a method: started by the front ends, then on its own."""
 
     causal = True
+    concurrent = False  # a step follows the pose of the one before
 
     def __init__(self, config: HatConfig, target: Target) -> None:
         config = replace(config, keyframes=replace(config.keyframes, gap_frames=1))

@@ -41,6 +41,7 @@ class ScriptedMethod:
     """Errors of one degree per frame; starts without a pose, coasts at frame 6, is lost from frame 8 on."""
 
     causal = True
+    concurrent = False
 
     def __init__(self) -> None:
         self.stages: dict = {}
