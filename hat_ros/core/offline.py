@@ -1,8 +1,9 @@
 """The paper's offline reference for Stages 3 and 4: what hindsight would have answered. Never causal.
 
 Over recorded observations of a whole sequence: the decoder's path is traced back from its end, the running gate becomes
-one verdict over all keyframes, each SLAM epoch is aligned once to all its anchors, and the poses of all frames are
-optimised together over the residuals of eq. (fusionresiduals).
+one verdict over all keyframes, each SLAM epoch is aligned once to its anchors, and the poses of all frames are
+optimised together. The causal gate weakens an anchor that disagrees with the motion because it cannot know which of
+the two is wrong; hindsight can, so an anchor that does not fit the others counts for nothing (:func:`consistent`).
 """
 
 from __future__ import annotations
@@ -29,14 +30,16 @@ class OfflineResult:
     Attributes:
         T_cam_target: (N, 4, 4) poses; NaN only when there is no anchor at all.
         chosen: (N,) index of the anchor among the frame's candidates, -1 where there is none.
+        gate_weight: (N,) 1 for an anchor that counted, 0 for one that was left out, NaN where there is none.
     """
 
     T_cam_target: Float
     chosen: NDArray[np.int64]
+    gate_weight: Float
 
 
 def solve_offline(candidates: Sequence[Candidates], motions: Sequence[Motion], config: HatConfig) -> OfflineResult:
-    """Decode, align and optimise a whole sequence.
+    """Decode, gate, align and optimise a whole sequence.
 
     Args:
         candidates: per frame, guarded; zero rows between keyframes.
@@ -46,23 +49,56 @@ def solve_offline(candidates: Sequence[Candidates], motions: Sequence[Motion], c
     chosen = backtrace(candidates, motions, config.selector)
     confidence = AreaConfidence(config.fusion)
     graph = PoseGraph(len(motions), config.fusion, config.alignment.lever_m_per_rad)
-    aligned = _align_epochs(candidates, motions, chosen, config)
-    for frame, index in enumerate(chosen):
-        if frame in aligned:
-            graph.add_pose(frame, aligned[frame][0])
-        if index >= 0:
-            anchor = candidates[frame].T_cam_target[index]
-            weight = confidence.update(box_area_px(candidates[frame].box_xyxy))
-            if frame in aligned and _disagree(anchor, aligned[frame][0], config):
-                weight *= config.fusion.gate_weight
-            else:
-                graph.add_pose(frame, anchor)
+    anchors, gate_weight = {}, np.full(len(motions), np.nan)
+    for frame in np.flatnonzero(chosen >= 0):
+        anchors[int(frame)] = candidates[frame].T_cam_target[chosen[frame]]
+        gate_weight[frame] = 1.0
+    for epoch in sorted({motion.epoch for motion in motions if motion.valid}):
+        joint = [frame for frame in anchors if motions[frame].valid and motions[frame].epoch == epoch]
+        kept = consistent([anchors[frame] for frame in joint], [motions[frame] for frame in joint], config)
+        gate_weight[[frame for frame, keep in zip(joint, kept, strict=True) if not keep]] = 0.0
+        _add_epoch(graph, motions, epoch, {frame: anchors[frame] for frame in joint if gate_weight[frame]}, config)
+    for frame, anchor in anchors.items():
+        weight = confidence.update(box_area_px(candidates[frame].box_xyxy))
+        if gate_weight[frame]:
+            graph.add_pose(frame, anchor)
             graph.add_anchor(frame, anchor, weight)
-        if frame in aligned and frame - 1 in aligned:
-            step = relative_motion(motions[frame - 1], motions[frame], aligned[frame][1])
-            if step is not None:
-                graph.add_step(frame, step)
-    return OfflineResult(_hold(graph.solve()), chosen)
+    return OfflineResult(_hold(graph.solve()), chosen, gate_weight)
+
+
+def consistent(anchors: Sequence[Float], motions: Sequence[Motion], config: HatConfig) -> NDArray[np.bool_]:
+    """Which anchors of one SLAM epoch belong to the longest history that the motion can tell: (n,) flags.
+
+    A history passes through anchors in order. Each one counts one; going on to an anchor whose rotation, propagated by
+    the motion, is more than D away costs ``reset_anchors``, so a rotation basin is entered only where enough anchors
+    stand for it. (The causal reset by four coherent anchors, in both directions of time. Only neighbours in the history
+    are compared, so the motion may drift.) If even the longest history leaves out most anchors, it is the motion that
+    cannot be believed, and all are kept.
+
+    Args:
+        anchors: n poses ``T_cam_target`` (4, 4) in order.
+        motions: n valid motions of one epoch.
+        config: D and ``reset_anchors``.
+    """
+    n = len(anchors)
+    gate_rad, cost = np.radians(config.fusion.gate_angle_deg), config.alignment.reset_anchors
+    # Every anchor's reading of the rotation between SLAM and target: the same for all if all is well.
+    readings = np.array([m.T_slam_cam[:3, :3] @ T[:3, :3] for m, T in zip(motions, anchors, strict=True)])
+    length, before = np.ones(n), np.full(n, -1)
+    for j in range(1, n):
+        disagree = lie.angle_between(readings[:j], readings[j]) > gate_rad
+        lengths = length[:j] - cost * disagree
+        # Among equals the latest: drift has had the least time.
+        best = j - 1 - int(np.argmax(lengths[::-1]))
+        if lengths[best] > 0:
+            length[j] += lengths[best]
+            before[j] = best
+    kept = np.zeros(n, dtype=bool)
+    at = n - 1 - int(np.argmax(length[::-1])) if n else -1
+    while at >= 0:
+        kept[at] = True
+        at = int(before[at])
+    return kept if 2 * np.count_nonzero(kept) >= n else np.ones(n, dtype=bool)
 
 
 def backtrace(candidates: Sequence[Candidates], motions: Sequence[Motion], config: SelectorConfig) -> NDArray[np.int64]:
@@ -107,28 +143,26 @@ def backtrace(candidates: Sequence[Candidates], motions: Sequence[Motion], confi
     return chosen
 
 
-def _align_epochs(
-    candidates: Sequence[Candidates], motions: Sequence[Motion], chosen: NDArray[np.int64], config: HatConfig
-) -> dict[int, tuple[Float, float]]:
-    """Frame -> aligned SLAM pose (4, 4) and metres per SLAM unit, for epochs with enough joint observations."""
-    alignments: dict[int, SlamAlignment] = {}
+def _add_epoch(
+    graph: PoseGraph, motions: Sequence[Motion], epoch: int, anchors: dict[int, Float], config: HatConfig
+) -> None:
+    """Poses and steps of a SLAM epoch that has enough anchors to tell its scale."""
+    alignment = SlamAlignment(config.alignment)
+    for frame, anchor in anchors.items():
+        alignment.observe(anchor, motions[frame].T_slam_cam)
+    alignment.update(epoch)
+    if alignment.current is None:
+        return
+    scale, at = alignment.current.scale, np.array(list(anchors))
     for frame, motion in enumerate(motions):
-        if motion.valid and chosen[frame] >= 0:
-            alignment = alignments.setdefault(motion.epoch, SlamAlignment(config.alignment))
-            alignment.observe(candidates[frame].T_cam_target[chosen[frame]], motion.T_slam_cam)
-    for epoch, alignment in alignments.items():
-        alignment.update(epoch)
-    out = {}
-    for frame, motion in enumerate(motions):
-        alignment = alignments.get(motion.epoch)
-        if motion.valid and alignment is not None and alignment.current is not None:
-            out[frame] = (alignment.aligned(motion.T_slam_cam), alignment.current.scale)
-    return out
-
-
-def _disagree(anchor: Float, aligned: Float, config: HatConfig) -> bool:
-    angle_rad = lie.angle_between(anchor[:3, :3], aligned[:3, :3])
-    return bool(angle_rad > np.radians(config.fusion.gate_angle_deg))
+        if not motion.valid or motion.epoch != epoch:
+            continue
+        # The motion drifts: the nearest anchor knows best where the search should start.
+        nearest = int(at[np.argmin(np.abs(at - frame))])
+        graph.add_pose(frame, relative_motion(motions[nearest], motion, scale) @ anchors[nearest])
+        step = relative_motion(motions[frame - 1], motion, scale) if frame else None
+        if step is not None:
+            graph.add_step(frame, step)
 
 
 def _hold(poses: Float) -> Float:

@@ -5,11 +5,11 @@ from itertools import product
 import numpy as np
 import pytest
 import scipy.optimize
-from temporal_scene import make_scene, preset, rotation_error_deg
+from temporal_scene import HALF_TURN, make_scene, preset, rotation_error_deg
 
 from hat_ros import lie
 from hat_ros.config import FusionConfig, SelectorConfig
-from hat_ros.core.offline import backtrace, solve_offline
+from hat_ros.core.offline import backtrace, consistent, solve_offline
 from hat_ros.core.pose_graph import PoseGraph
 from hat_ros.core.selector import motion_penalty, scaled_score
 from hat_ros.temporal import run_temporal
@@ -83,6 +83,76 @@ def test_frames_without_slam_or_anchor_hold_their_neighbour():
     assert np.isnan(empty.T_cam_target).all()
 
 
+def _tumbling_motion(scene, scale_drift=0.0, drift_deg=0.0):
+    """The scene's motion with a scale and a rotation that drift by this much per frame."""
+    out = []
+    for i, T in enumerate(scene.observations.slam):
+        drifted = T.copy()
+        drifted[:3, :3] = lie.so3_exp(np.radians([drift_deg * i, 0, 0])) @ T[:3, :3]
+        drifted[:3, 3] *= 1 + scale_drift * i
+        out.append(Motion(True, 0, lie.row_from_matrix(drifted)))
+    return out
+
+
+@pytest.mark.parametrize("weight", [0.002, 0.1])
+def test_poses_do_not_bow_between_anchors_when_the_scale_drifts(weight):
+    """Anchors are true; the target tumbles by 4 degrees per frame 8 m away, the scale is wrong nearly everywhere."""
+    scene = make_scene(120, gap=6, noise_deg=0, noise_m=0, rate_deg=4, gauge=np.eye(4))
+    candidates, _ = _recorded(scene)
+    config = preset("pico_hat", fusion={"relative_weight": weight}, selector={"running_gate": False})
+    result = solve_offline(candidates, _tumbling_motion(scene, scale_drift=0.001), config)
+    keys = np.flatnonzero(scene.observations.key)
+    between = slice(keys[0], keys[-1])
+    shift_m = np.linalg.norm(result.T_cam_target[:, :3, 3] - scene.T_cam_target[:, :3, 3], axis=1)
+    assert rotation_error_deg(result.T_cam_target, scene.T_cam_target)[between].max() < 0.1
+    assert shift_m[between].max() < 0.1
+
+
+class TestConsistent:
+    CONFIG = preset("pico_hat")
+
+    @staticmethod
+    def _anchors(n=30, wrong=(), **drift):
+        scene = make_scene(n, gap=1, rate_deg=2, gauge=lie.transform(lie.so3_exp(np.array([1.0, 2, 3])), np.ones(3)))
+        anchors = list(scene.T_cam_target)
+        for i in wrong:
+            anchors[i] = lie.transform(anchors[i][:3, :3] @ HALF_TURN, anchors[i][:3, 3])
+        return anchors, _tumbling_motion(scene, **drift)
+
+    @pytest.mark.parametrize("wrong", [(7,), (0,), (29,), (3, 11, 12, 20), (10, 11, 12, 13, 14), (27, 28, 29)])
+    def test_leaves_out_what_does_not_fit_the_others(self, wrong):
+        kept = consistent(*self._anchors(wrong=wrong), self.CONFIG)
+        assert np.flatnonzero(~kept).tolist() == list(wrong)
+
+    def test_a_change_of_basin_that_enough_anchors_stand_for_is_followed(self):
+        kept = consistent(*self._anchors(wrong=range(18, 30)), self.CONFIG)
+        assert kept.all()
+
+    def test_motion_that_drifts_by_any_angle_leaves_out_nothing(self):
+        kept = consistent(*self._anchors(wrong=(9,), drift_deg=6.0), self.CONFIG)
+        assert np.flatnonzero(~kept).tolist() == [9]
+
+    def test_motion_that_fits_nothing_proves_nothing(self):
+        kept = consistent(*self._anchors(drift_deg=70.0), self.CONFIG)
+        assert kept.all()
+
+    def test_few_or_no_anchors(self):
+        assert consistent([], [], self.CONFIG).shape == (0,)
+        anchors, motions = self._anchors(n=1)
+        assert consistent(anchors, motions, self.CONFIG).tolist() == [True]
+
+    def test_what_was_left_out_is_said(self):
+        scene = make_scene(60, k=2, gap=4, noise_deg=1, rival_score=0.1)
+        candidates, motions = _recorded(scene)
+        T = candidates[20].T_cam_target[0]
+        flipped = lie.transform(scene.T_cam_target[20, :3, :3] @ HALF_TURN, T[:3, 3])
+        candidates[20] = Candidates.from_matrices(flipped[None], np.ones(1))
+        result = solve_offline(candidates, motions, preset(selector={"motion_weight_per_deg": 0.0}))
+        assert np.flatnonzero(result.gate_weight == 0.0).tolist() == [20]
+        assert np.isnan(result.gate_weight[1])
+        assert rotation_error_deg(result.T_cam_target[20], scene.T_cam_target[20]) < 5
+
+
 class TestPoseGraph:
     @staticmethod
     def _graph(config, seed=0, n=6):
@@ -116,8 +186,8 @@ class TestPoseGraph:
             for i, M, g in terms["anchors"]:
                 out += [g * lie.so3_log(M[:3, :3] @ T[i, :3, :3].T), g * (M[:3, 3] - T[i, :3, 3])]
             for i, step in terms["steps"]:
-                E = step @ T[i - 1] @ lie.inverse(T[i])
-                out += [0.5 * lie.so3_log(E[:3, :3]), 0.5 * E[:3, 3]]
+                predicted = step @ T[i - 1]
+                out += [0.5 * lie.so3_log(predicted[:3, :3] @ T[i, :3, :3].T), 0.5 * (predicted - T[i])[:3, 3]]
             return np.concatenate(out)
 
         kind = {} if loss == "linear" else {"loss": "huber", "f_scale": 0.05}
