@@ -135,12 +135,6 @@ class DroidConfig:
     """DROID-SLAM; distances are flow in units of 8 pixels of the resized image."""
 
     input_area_px: int = option(196608, "image area after resizing, px (SwissCube: 393216)", low=4096, high=4194304)
-    device: str = option("auto", "auto (cuda if there is one), cpu, cuda or cuda:N")
-    precision: str = option(
-        "auto",
-        "of the networks: auto (float16 on cuda, float32 elsewhere), float32, float16 or bfloat16",
-        choices=("auto", "float32", "float16", "bfloat16"),
-    )
     correlation: str = option(
         "auto",
         "stored volumes, on_the_fly (less memory, more work), or auto: stored while they fit in 4 GiB",
@@ -216,6 +210,7 @@ class FusionConfig:
     """Stage 4b: the causal pose."""
 
     relative_weight: float = option(0.1, "w: weight of the relative-motion residual", low=0)
+    inertial_weight: float = option(0.0, "weight of the inertial prior: constant rates; 0 = off, as published", low=0)
     gate_angle_deg: float = option(30.0, "D: anchor and aligned SLAM rotation disagree beyond this angle", low=0)
     gate_weight: float = option(0.05, "g of a disagreeing anchor", low=0, high=1)
     huber_delta_m: float = option(0.3, "delta: scale of the componentwise Huber loss", low=1e-9)
@@ -258,8 +253,12 @@ class PriorConfig:
 class NetsConfig:
     """Where and how the learned backends run."""
 
-    device: str = option("auto", "auto (an accelerator if there is one), cpu or cuda", choices=("auto", "cpu", "cuda"))
-    precision: str = option("float32", "arithmetic on an accelerator", choices=("float32", "float16", "bfloat16"))
+    device: str = option("auto", "auto (cuda if there is one), cpu, cuda or cuda:N")
+    precision: str = option(
+        "auto",
+        "of networks on cuda: auto (as released: DROID float16, others float32), float32, float16 or bfloat16",
+        choices=("auto", "float32", "float16", "bfloat16"),
+    )
     weights_folder: str = option("", "folder of the checkpoints; empty: HAT_WEIGHTS, else the user's data folder")
 
 
@@ -269,7 +268,7 @@ class GraphConfig:
 
     credits_replay: int = option(4, "W: frames in flight during replay", low=1, high=16)
     stage_timeout_s: float = option(30.0, "a stage that does not answer in this time is an error", low=0.1)
-    startup_timeout_s: float = option(180.0, "a node that is not ready in this time is an error", low=1)
+    startup_timeout_s: float = option(180.0, "a node that is not ready, nor says why, in this time is an error", low=1)
     debug_stage_delay_ms: float = option(0.0, "for latency studies: random extra time per frame, at most this", low=0)
 
 

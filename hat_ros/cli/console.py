@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -24,6 +26,20 @@ STATE_STYLE = {
 
 
 @contextmanager
+def log_shown(console: Console) -> Iterator[None]:
+    """What takes long says so: log records of this package appear as lines above the bar."""
+    log, handler = logging.getLogger("hat_ros"), RichHandler(console=console, show_level=False, show_path=False)
+    before = log.level
+    log.setLevel(logging.INFO)
+    log.addHandler(handler)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(before)
+
+
+@contextmanager
 def state_progress(title: str, quiet: bool) -> Iterator[Callable[[int, int, TrackState], None]]:
     """A bar with frames per second and state; yields what to call with (frames done, frames in all, newest state)."""
     columns = (
@@ -34,7 +50,8 @@ def state_progress(title: str, quiet: bool) -> Iterator[Callable[[int, int, Trac
         TextColumn("{task.fields[state]}"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True), disable=quiet) as progress:
+    console = Console(stderr=True, quiet=quiet)
+    with log_shown(console), Progress(*columns, console=console, disable=quiet) as progress:
         task = progress.add_task(title, total=None, fps=0.0, state="")
         started: list[float] = []
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -19,6 +21,8 @@ from hat_ros.nets.checkpoint import load_into, load_state
 from hat_ros.render.network_views import NetworkViewRenderer
 from hat_ros.target import Target
 from hat_ros.types import Candidates, Detection, Frame, PosePrior
+
+LOG = logging.getLogger(__name__)
 
 _FORMAT = 1
 
@@ -48,6 +52,7 @@ class GigaPoseHypotheses:
     @torch.inference_mode()
     def _build(self, target: Target) -> dict[str, NDArray]:
         renderer, poses = NetworkViewRenderer(target), template_poses(target)
+        LOG.info("rendering %d templates, once per CAD model", len(poses))
         crops, masks, Ms = [], [], []
         for T in poses:
             rgb = renderer.render(T, TEMPLATE_K, TEMPLATE_SIZE)[..., :3]
@@ -57,10 +62,11 @@ class GigaPoseHypotheses:
             masks.append(cut(mask.astype(np.uint8), M))
             Ms.append(M)
         features, ist = [], []
-        for i in range(0, len(poses), self._batch_size):
-            batch = _network_input(self._runtime.tensor(np.stack(crops[i : i + self._batch_size])))
-            features.append(self._describe(batch).cpu().numpy())
-            ist.append(self._describe_ist(batch).cpu().numpy())
+        for batch in self._runtime.batches(len(poses), self._batch_size):
+            inputs = _network_input(self._runtime.tensor(np.stack(crops[batch])))
+            features.append(self._describe(inputs).cpu().numpy())
+            ist.append(self._describe_ist(inputs).cpu().numpy())
+            LOG.info("encoded %d of %d templates, once per CAD model and checkpoint", batch.stop, len(poses))
         small = pp.patch_mask(torch.from_numpy(np.stack(masks).astype(np.float32))).numpy()
         arrays = {"features": np.concatenate(features), "ist": np.concatenate(ist), "masks": small}
         return arrays | {"M": np.stack(Ms), "T_cam_target": poses}

@@ -9,6 +9,7 @@ refiner passes, K + 20 K renders (K re-scored, 4 views x 5 iterations x K), inst
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Callable
 from functools import cached_property
 
@@ -28,6 +29,8 @@ from hat_ros.nets.so3_grid import so3_grid
 from hat_ros.render.network_views import NetworkViewRenderer
 from hat_ros.target import Target
 from hat_ros.types import Camera, Candidates, Detection, Frame, PosePrior
+
+LOG = logging.getLogger(__name__)
 
 _FORMAT = 1
 _N_CROP_POINTS, _N_VIEW_POINTS = 2000, 200
@@ -69,11 +72,10 @@ class MegaPose:
     @torch.inference_mode()
     def score_prepared(self, image: Tensor, boxes: Tensor, renders: Tensor) -> Tensor:
         """Coarse logits of ready uint8 renders, in batches: (3, H, W), (B, 4), (B, 6, 240, 320) -> (B,)."""
-        size = self.settings.batch_size
         logits = []
-        for i in range(0, len(boxes), size):
-            views = renders[i : i + size].to(self.runtime.device).float() / 255
-            logits.append(mp.score_renders(self._coarse, image, boxes[i : i + size], views))
+        for batch in self.runtime.batches(len(boxes), self.settings.batch_size):
+            views = renders[batch].to(self.runtime.device).float() / 255
+            logits.append(mp.score_renders(self._coarse, image, boxes[batch], views))
         return torch.cat(logits)
 
 
@@ -123,6 +125,7 @@ class MegaPoseHypotheses:
         return self._views[1]
 
     def _render_coarse(self, camera: Camera) -> NDArray[np.uint8]:
+        LOG.info("rendering %d coarse views, once per CAD model and camera", len(self._grid))
         runtime, points = self._megapose.runtime, self._megapose.points
         half = _CANONICAL_HALF_SIZE * min(camera.width, camera.height)
         centre = np.array([camera.width, camera.height]) / 2

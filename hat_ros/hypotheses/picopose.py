@@ -7,6 +7,7 @@ templates' features are computed once per CAD model and checkpoint and memory-ma
 from __future__ import annotations
 
 import hashlib
+import logging
 
 import cv2
 import numpy as np
@@ -30,6 +31,8 @@ from hat_ros.nets.checkpoint import load_into, load_state
 from hat_ros.nets.runtime import Runtime
 from hat_ros.target import Target
 from hat_ros.types import Candidates, Detection, Frame, PosePrior
+
+LOG = logging.getLogger(__name__)
 
 _FORMAT = 1
 _MIN_CORRESPONDENCES = 4
@@ -65,12 +68,12 @@ class PicoPoseHypotheses:
     @torch.inference_mode()
     def _build(self, target: Target) -> dict[str, NDArray]:
         templates: Templates = render_templates(target)
-        size = self._settings.batch_size
         levels: list[list[NDArray]] = [[] for _ in pp.FEATURE_BLOCKS]
-        for i in range(0, len(templates.crops), size):
-            crops = pp.normalise_crops(self._runtime.tensor(templates.crops[i : i + size]))
+        for batch in self._runtime.batches(len(templates.crops), self._settings.batch_size):
+            crops = pp.normalise_crops(self._runtime.tensor(templates.crops[batch]))
             for level, features in zip(levels, self._extract(crops), strict=True):
                 level.append(features.float().cpu().numpy())
+            LOG.info("encoded %d of %d templates, once per CAD model and checkpoint", batch.stop, len(templates.crops))
         out = {f"features{i}": np.concatenate(level) for i, level in enumerate(levels)}
         masks = pp.patch_mask(torch.from_numpy(templates.masks)).numpy()
         return (

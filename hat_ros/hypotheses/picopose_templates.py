@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import cv2
@@ -14,6 +15,8 @@ from hat_ros.render.icosphere import icosphere, look_at_origin
 from hat_ros.render.network_views import NetworkViewRenderer
 from hat_ros.target import Target
 from hat_ros.types import Camera
+
+LOG = logging.getLogger(__name__)
 
 TEMPLATE_K = np.array([[572.4114, 0.0, 320.0], [0.0, 573.57043, 240.0], [0.0, 0.0, 1.0]])
 TEMPLATE_SIZE = (640, 480)
@@ -103,6 +106,7 @@ def render_templates(target: Target) -> Templates:
     K[:2, 2] -= 0.5
     camera = Camera(K, *TEMPLATE_SIZE)
     poses = template_poses(target)
+    LOG.info("rendering %d templates, once per CAD model", len(poses))
     crops, masks, Ms, points = [], [], [], []
     for T in poses:
         view = shapes.render(T, camera, color=False)

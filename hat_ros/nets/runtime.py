@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -12,32 +12,42 @@ from numpy.typing import NDArray
 from hat_ros.config import NetsConfig
 from hat_ros.errors import ConfigError
 
+_PRECISIONS = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
+# Larger batches fall out of the processor's cache: measured a quarter slower at 64 images of 240 x 320.
+_CPU_BATCH = 8
+
 
 class Runtime:
-    """Device and arithmetic of the learned backends.
+    """Device and arithmetic of a learned backend.
 
     Args:
         config: the ``nets`` section.
+        as_released: what ``nets.precision: auto`` means on an accelerator: the precision that the network was
+            published to run in.
+
+    Attributes:
+        device: where the network and its tensors live.
+        dtype: what the network computes in; float32 on the CPU, whatever the configuration says.
 
     Raises:
-        ConfigError: ``cuda`` is asked for and there is none.
+        ConfigError: the device is unknown or not on this machine.
     """
 
-    def __init__(self, config: NetsConfig) -> None:
-        if config.device == "cuda" and not torch.cuda.is_available():
-            raise ConfigError("nets.device is 'cuda' but torch sees no such device; use 'auto' or 'cpu'")
-        use_cuda = config.device == "cuda" or (config.device == "auto" and torch.cuda.is_available())
-        self.device = torch.device("cuda" if use_cuda else "cpu")
-        self.dtype = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}[config.precision]
+    def __init__(self, config: NetsConfig, as_released: torch.dtype = torch.float32) -> None:
+        self.device = choose_device(config.device)
+        named = as_released if config.precision == "auto" else _PRECISIONS[config.precision]
+        self.dtype = torch.float32 if self.device.type == "cpu" else named
 
     @property
     def reduced_precision(self) -> bool:
         """Whether networks compute in less than float32; never on the CPU."""
-        return self.device.type != "cpu" and self.dtype != torch.float32
+        return self.dtype != torch.float32
 
     def place(self, net: torch.nn.Module) -> Callable[..., Any]:
         """The network on the device, for inference only, and :meth:`wrap` around it."""
-        return self.wrap(net.to(self.device).eval().requires_grad_(False))
+        # Channels last: what convolutions are fastest in, an eighth on the CPU and more on tensor cores.
+        net = net.to(self.device, memory_format=torch.channels_last)
+        return self.wrap(net.eval().requires_grad_(False))
 
     def wrap(self, net: torch.nn.Module) -> Callable[..., Any]:
         """A placed network that computes in the chosen precision and answers in float32.
@@ -63,3 +73,28 @@ class Runtime:
         """(H, W, 3) uint8 -> (3, H, W) float32 in [0, 1] on the device; moved as bytes."""
         moved = torch.from_numpy(np.ascontiguousarray(rgb)).to(self.device)
         return moved.permute(2, 0, 1).float() / 255
+
+    def batches(self, n_images: int, size: int) -> Iterator[slice]:
+        """Slices that cover ``n_images``, at most ``size`` images each and no more than pays on this device."""
+        step = size if self.device.type != "cpu" else min(size, _CPU_BATCH)
+        for start in range(0, n_images, step):
+            yield slice(start, min(start + step, n_images))
+
+
+def choose_device(name: str) -> torch.device:
+    """Device of a configuration value.
+
+    Raises:
+        ConfigError: unknown, or CUDA is asked for and absent.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        device = None
+    if device is None or device.type not in ("cpu", "cuda"):
+        raise ConfigError(f"nets.device: '{name}' is not a device, use auto, cpu, cuda or cuda:N")
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise ConfigError(f"nets.device: '{name}' is not on this machine, use auto or cpu")
+    return device

@@ -6,10 +6,12 @@ once: a node that fails says so in one sentence, in ``/diagnostics`` and on stde
 
 from __future__ import annotations
 
+import logging
 import os
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, ClassVar
 
@@ -21,6 +23,7 @@ from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
+from hat_ros.config import GraphConfig
 from hat_ros.errors import HatError, RunError
 from hat_ros.nodes import qos, topics
 from hat_ros.nodes.params import declare_parameters
@@ -29,11 +32,32 @@ from hat_ros.nodes.wire import Wire, message_class
 OK, WARN, ERROR = 0, 1, 2
 # Ends the sentence of a stage timeout, so that whoever started the node can tell it from other failures.
 HANGS = "a stage does not answer"
+# Begins what a node says while it works on something that takes long, so that nobody takes it for dead.
+BUSY = "busy: "
 _ACK_TIMEOUT_S = 10.0
 # Each event is an entity more in every wait; between our own nodes readiness already says what does not fit.
 _NO_EVENTS = SubscriptionEventCallbacks(use_default_callbacks=False)
 _NO_PUBLISHER_EVENTS = PublisherEventCallbacks(use_default_callbacks=False)
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+
+
+def answer_limit(config: GraphConfig, first: bool) -> tuple[float, str]:
+    """How long a frame may take through the graph, and the option to raise; the first one also compiles code."""
+    if first and config.startup_timeout_s > config.stage_timeout_s:
+        return config.startup_timeout_s, "graph.startup_timeout_s"
+    return config.stage_timeout_s, "graph.stage_timeout_s"
+
+
+class _Busy(logging.Handler):
+    """What the algorithms log while a node runs them: into the node's log and its diagnostics."""
+
+    def __init__(self, node: HatNode) -> None:
+        super().__init__(logging.INFO)
+        self._node = node
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._node.get_logger().info(record.getMessage())
+        self._node.report(OK, f"{BUSY}{record.getMessage()}")
 
 
 class HatNode(LifecycleNode):
@@ -144,7 +168,8 @@ class HatNode(LifecycleNode):
         if not self.active:
             return
         try:
-            callback(*args)
+            with self._heard():
+                callback(*args)
         except HatError as error:
             self.fail(error)
         except Exception as error:
@@ -152,6 +177,18 @@ class HatNode(LifecycleNode):
                 return
             self.get_logger().error(traceback.format_exc())
             self.fail(RunError(f"{type(error).__name__}: {error}"))
+
+    @contextmanager
+    def _heard(self) -> Iterator[None]:
+        """What is logged inside is reported as it comes; then the node says again what it said before."""
+        before, handler, log = (self._level, self._text), _Busy(self), logging.getLogger("hat_ros")
+        log.addHandler(handler)
+        try:
+            yield
+        finally:
+            log.removeHandler(handler)
+            if self._text.startswith(BUSY):
+                self.report(*before)
 
     def fail(self, error: HatError) -> None:
         """Say what went wrong; a replay ends, a live graph goes on (its next epoch starts without this frame)."""
@@ -275,7 +312,8 @@ class HatNode(LifecycleNode):
 
     def _transition(self, action: Callable[[], None]) -> TransitionCallbackReturn:
         try:
-            action()
+            with self._heard():
+                action()
         except HatError as error:
             self.fail(error)
             return TransitionCallbackReturn.FAILURE

@@ -6,6 +6,7 @@ Every replay has a ROS domain of its own, so that runs side by side, and a robot
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import signal
 import subprocess
@@ -34,6 +35,8 @@ from hat_ros.nodes.player_node import PlayerNode
 from hat_ros.nodes.process import close as close_nodes
 from hat_ros.nodes.recorder_node import RecorderNode
 from hat_ros.nodes.wire import Status, Wire
+
+LOG = logging.getLogger(__name__)
 
 STAGES = ("segmentation", "hypotheses", "slam", "selector", "fusion")
 # What each stage sends for every frame, in the order of the data flow; segmentation's own answer is an image.
@@ -171,6 +174,7 @@ class _Run:
         self._executor = SingleThreadedExecutor(context=self._context)
         self._nodes: list[base.HatNode] = []
         self._peak_memory_mib: dict[str, float] = {}
+        self._heard: dict[str, str] = {}
         self._next_look_s = 0.0
 
     def start_nodes(self, graph: str, delays_ms: Mapping[str, float]) -> None:
@@ -217,6 +221,7 @@ class _Run:
         while not player.finished:
             self._executor.spin_once(timeout_sec=0.1)
             self._check()
+            self._relay()
             answered = min(player.n_status, self._recorder.counts[topics.STATUS])  # what is reported is also recorded
             if answered != done:
                 done = answered
@@ -245,6 +250,13 @@ class _Run:
                 raise StageTimeoutError(f"{node.failure}: {self._culprit()}") from None
             if node.failure is not None:
                 raise node.failure
+
+    def _relay(self) -> None:
+        """Log here what a node says that is at work on something that takes long."""
+        for name, text in self._player.said.items():
+            if self._heard.get(name) != text and text.startswith(base.BUSY):
+                LOG.info("%s: %s", name, text.removeprefix(base.BUSY))
+            self._heard[name] = text
 
     def _note_memory(self) -> None:
         """Peak memory of the node processes, looked at twice a second."""

@@ -117,7 +117,10 @@ class PlayerNode(base.HatNode):
     def _on_diagnostics(self, message: Any) -> None:
         """Frames rejected after the last status are known from here alone; and why a node is not ready."""
         for status in message.status:
-            self.said[status.name.removeprefix("hat: ")] = status.message
+            name = status.name.removeprefix("hat: ")
+            if not self._is_open and self.said.get(name) != status.message:
+                self.progress_s = time.monotonic()  # whoever says something new is at work
+            self.said[name] = status.message
             if status.name == "hat: segmentation":
                 counts = {item.key: item.value for item in status.values}
                 self.dropped = max(self.dropped, int(counts.get("dropped", 0)))
@@ -128,7 +131,8 @@ class PlayerNode(base.HatNode):
             if not self._is_open:
                 absent = [name for name in self.settings.extra["wait_for"] if name not in self._ready_nodes]
                 why = "; ".join(f"{name}: {self.said.get(name, 'silent')}" for name in absent) or self.unmatched()
-                self._check_time(self.settings.config.graph.startup_timeout_s, f"the graph was not ready ({why})")
+                limit_s = self.settings.config.graph.startup_timeout_s
+                self._check_time(limit_s, f"the graph was not ready ({why})", "graph.startup_timeout_s")
                 return
         while self._next is not None and self._may_send(self._next):
             self._send(self._next)
@@ -136,9 +140,8 @@ class PlayerNode(base.HatNode):
         if self._is_done():
             self._finish()
         elif self.outstanding > 0 and not (self.settings.live and self.n_status):
-            graph = self.settings.config.graph
-            limit_s = graph.stage_timeout_s if self.n_status else graph.startup_timeout_s
-            self._check_time(limit_s, f"frame {self.published - self.outstanding} was not answered")
+            limit_s, option = base.answer_limit(self.settings.config.graph, first=not self.n_status)
+            self._check_time(limit_s, f"frame {self.published - self.outstanding} was not answered", option)
 
     def _is_done(self) -> bool:
         """Everything sent was answered or dropped; live, where a hanging stage costs frames, the last one was."""
@@ -184,9 +187,9 @@ class PlayerNode(base.HatNode):
         self._end.wait_for_all_acked(Duration(seconds=5))
         self.finished = True
 
-    def _check_time(self, limit_s: float, what: str) -> None:
+    def _check_time(self, limit_s: float, what: str, option: str) -> None:
         if time.monotonic() - self.progress_s > limit_s:
-            raise StageTimeoutError(f"{what} within {limit_s:g} s")
+            raise StageTimeoutError(f"{what} within {limit_s:g} s (raise {option} if it is only slow)")
 
 
 def main() -> int:

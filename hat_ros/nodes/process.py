@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Sequence
 
@@ -40,6 +41,7 @@ def main(node_classes: Sequence[type[HatNode]], args: Sequence[str] | None = Non
     """Entry point of every node process: 0 done, 1 failed, 2 bad input, with one sentence on stderr."""
     prepare_environment()
     keep_large_blocks()
+    logging.getLogger("hat_ros").setLevel(logging.INFO)
     context = rclpy.Context()
     rclpy.init(
         args=list(sys.argv if args is None else args),

@@ -131,14 +131,14 @@ class SegmentationNode(base.HatNode):
     def _check_time(self) -> None:
         """A stage that does not answer: a replay ends, a live graph goes on in a new epoch."""
         oldest = next(iter(self._entered_s), None)
-        graph = self.settings.config.graph
-        limit_s = graph.stage_timeout_s if self._is_warm else graph.startup_timeout_s  # the first frame compiles code
+        limit_s, option = base.answer_limit(self.settings.config.graph, first=not self._is_warm)
         if oldest is not None and time.monotonic() - self._entered_s[oldest] > limit_s:
             self.admission.give_up()
             self._entered_s.clear()
             self._new_epoch()
             self._is_open = False
-            self.fail(StageTimeoutError(f"no status for frame {oldest} within {limit_s:g} s: {base.HANGS}"))
+            late = f"no status for frame {oldest} within {limit_s:g} s (raise {option} if it is only slow)"
+            self.fail(StageTimeoutError(f"{late}: {base.HANGS}"))
         elif self._is_open and len(self.entrance) and self.entrance.camera is None:
             self.report(base.WARN, f"images arrive, but no calibration on {topics.CAMERA_INFO}")
         self._pump()

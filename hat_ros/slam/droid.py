@@ -16,6 +16,7 @@ from hat_ros import lie
 from hat_ros.config import DroidConfig, HatConfig
 from hat_ros.errors import ConfigError
 from hat_ros.nets.droid import STRIDE_PX, DroidNet
+from hat_ros.nets.runtime import Runtime
 from hat_ros.slam.droid_frontend import DroidFrontend
 from hat_ros.slam.droid_graph import MAX_FACTORS
 from hat_ros.slam.droid_keyframes import FlowModel
@@ -23,7 +24,6 @@ from hat_ros.slam.droid_offline import finish
 from hat_ros.target import Target
 from hat_ros.types import Camera, Detection, Frame, Motion, PosePrior
 
-_PRECISIONS = {"float32": None, "float16": torch.float16, "bfloat16": torch.bfloat16}
 # Correlation needs this many 1/8 pixels on the short side for its coarsest level to hold one.
 _MIN_SIDE = 8
 _MAX_VOLUME_BYTES = 4 * 2**30
@@ -48,11 +48,12 @@ class DroidSlam:
 
     def __init__(self, config: HatConfig, target: Target | None, model: FlowModel | None = None) -> None:
         self._config, self._masked = config.slam.droid, config.slam.masked
-        self._device = choose_device(self._config.device)
+        runtime = Runtime(config.nets, as_released=torch.float16)
+        self._device = runtime.device
         self._model = model or DroidNet.from_checkpoint(
             config.nets.weights_folder or None,
-            device=self._device,
-            autocast=choose_precision(self._config.precision, self._device),
+            device=runtime.device,
+            autocast=runtime.dtype if runtime.reduced_precision else None,
         )
         self._frontend: DroidFrontend | None = None
         self._camera: Camera | None = None
@@ -159,30 +160,6 @@ def prepare(frame: Frame, config: DroidConfig) -> tuple[NDArray[np.uint8], NDArr
     # The released pre-processing scales the principal point without the half-pixel shift.
     intrinsics = np.array([K[0, 0] * sx, K[1, 1] * sy, K[0, 2] * sx, K[1, 2] * sy])
     return np.ascontiguousarray(cropped.transpose(2, 0, 1))[None], intrinsics
-
-
-def choose_device(name: str) -> torch.device:
-    """Device of a configuration value.
-
-    Raises:
-        ConfigError: unknown, or CUDA is asked for and absent.
-    """
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        raise ConfigError(f"slam.droid.device: '{name}' is not a device, use auto, cpu, cuda or cuda:N") from None
-    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        raise ConfigError(f"slam.droid.device: '{name}' is not on this machine, use auto or cpu")
-    return device
-
-
-def choose_precision(name: str, device: torch.device) -> torch.dtype | None:
-    """Autocast type of a configuration value; None is float32."""
-    if name == "auto":
-        return torch.float16 if device.type == "cuda" else None
-    return _PRECISIONS[name]
 
 
 def keep_volumes(config: DroidConfig, shape: tuple[int, int], dtype: torch.dtype) -> bool:

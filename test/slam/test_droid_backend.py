@@ -9,13 +9,11 @@ from flow_oracle import SMALL, FlowOracle, make_clip, oracle_config, similarity_
 from rule_weights import save_rule_weights
 
 from hat_ros import lie
-from hat_ros.config import DroidConfig, HatConfig, SlamConfig
+from hat_ros.config import DroidConfig, HatConfig, NetsConfig, SlamConfig
 from hat_ros.errors import ConfigError, RunError, WeightsError
 from hat_ros.nets.droid import DroidNet
 from hat_ros.slam.droid import (
     DroidSlam,
-    choose_device,
-    choose_precision,
     keep_volumes,
     offline_motions,
     prepare,
@@ -56,8 +54,9 @@ def test_runs_from_a_weights_folder(tmp_path, monkeypatch):
     """Weights that mean nothing still give a motion or none, never a guess that is not finite."""
     save_rule_weights(tmp_path, "droid", DroidNet())
     monkeypatch.setenv("HAT_WEIGHTS", str(tmp_path))
-    settings = DroidConfig(input_area_px=4096 + 1024, filter_threshold=0.0, warmup_keyframes=5, device="cpu")
-    slam = create_backend("slam", HatConfig(slam=SlamConfig(backend="droid", droid=settings)), None)
+    settings = DroidConfig(input_area_px=4096 + 1024, filter_threshold=0.0, warmup_keyframes=5)
+    config = HatConfig(slam=SlamConfig(backend="droid", droid=settings), nets=NetsConfig(device="cpu"))
+    slam = create_backend("slam", config, None)
     K = np.array([[90.0, 0, 40], [0, 90, 32], [0, 0, 1]])
     seen = Detection(np.ones((64, 80), dtype=bool))
     motions = [slam.update(frame_of(80, 64, stamp, K), seen, None) for stamp in range(1, 8)]
@@ -103,19 +102,6 @@ def test_odd_sizes_are_cropped_right_and_bottom():
 def test_too_small_an_input_area_is_named():
     with pytest.raises(ConfigError, match="input_area_px 4096"):
         prepare(frame_of(640, 200), DroidConfig(input_area_px=4096))
-
-
-@pytest.mark.parametrize("name", ["gpu", "cuda:99", "cpu:cpu"])
-def test_unknown_devices_are_named(name):
-    with pytest.raises(ConfigError, match=name):
-        choose_device(name)
-
-
-def test_precision_follows_the_device():
-    assert choose_precision("auto", torch.device("cpu")) is None
-    assert choose_precision("auto", torch.device("cuda")) == torch.float16
-    assert choose_precision("float32", torch.device("cuda")) is None
-    assert choose_precision("bfloat16", torch.device("cpu")) == torch.bfloat16
 
 
 def test_volumes_are_stored_while_they_fit():
