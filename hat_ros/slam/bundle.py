@@ -142,6 +142,59 @@ def cholesky_solve(L: Float, b: Float) -> Float:
 
 
 @njit(cache=True, nogil=True)
+def _factor_system(S: Float) -> bool:
+    """Factor U of a symmetric matrix, S = U^T U, read from and written to the upper triangle; False if not definite.
+
+    Row by row, so that the inner loop runs along memory and has no sum to carry: the compiler can use vectors.
+    """
+    n = S.shape[0]
+    for j in range(n):
+        if not S[j, j] > 0.0:
+            return False
+        S[j, j] = np.sqrt(S[j, j])
+        pivot_row = S[j, j + 1 :]
+        inverse = 1.0 / S[j, j]
+        for k in range(len(pivot_row)):
+            pivot_row[k] *= inverse
+        for i in range(len(pivot_row)):
+            f = pivot_row[i]
+            source, row = pivot_row[i:], S[j + 1 + i, j + 1 + i :]
+            for k in range(len(row)):
+                row[k] -= f * source[k]
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _solve_system(U: Float, b: Float) -> Float:
+    """Solution of ``U^T U x = b``."""
+    n = U.shape[0]
+    x = b.copy()
+    for i in range(n):
+        x[i] /= U[i, i]
+        f = x[i]
+        rest, row = x[i + 1 :], U[i, i + 1 :]
+        for k in range(len(row)):
+            rest[k] -= f * row[k]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            x[i] -= U[i, k] * x[k]
+        x[i] /= U[i, i]
+    return x
+
+
+@njit(cache=True, nogil=True)
+def _inverse_of_square(U: Float) -> Float:
+    """Inverse of ``U^T U``."""
+    n = U.shape[0]
+    inverse = np.empty((n, n))
+    for a in range(n):
+        unit = np.zeros(n)
+        unit[a] = 1.0
+        inverse[a] = _solve_system(U, unit)
+    return inverse
+
+
+@njit(cache=True, nogil=True)
 def _observe(R: Float, t: Float, X: Float, xn: Float, focal: float, r: Float, J_pose: Float, J_point: Float) -> bool:
     """Residual (2,) px and its Jacobians (2, 6), (2, 3); False when the point is behind the camera."""
     rx = R[0, 0] * X[0] + R[0, 1] * X[1] + R[0, 2] * X[2]
@@ -266,7 +319,7 @@ def window_cost(R: Float, t: Float, X: Float, p: Problem) -> float:
 
 @njit(cache=True, nogil=True)
 def _add_rate_terms(S: Float, g: Float, R: Float, t: Float, p: Problem) -> None:
-    """Constant-rate prior: adds to the lower triangle of S (6W, 6W) and to the descent direction g (6W,)."""
+    """Constant-rate prior: adds to the upper triangle of S (6W, 6W) and to the descent direction g (6W,)."""
     J = np.empty((3, 3, 3))
     c = np.empty(3)
     for k in range(1, len(R) - 1):
@@ -285,7 +338,7 @@ def _add_rate_terms(S: Float, g: Float, R: Float, t: Float, p: Problem) -> None:
                 for a in range(3):
                     g[row + b] -= w_turn * J[f, a, b] * (after[a] * i2 - before[a] * i1)
                 g[row + 3 + b] -= w_move * c[f] * ((t[k + 1, b] - t[k, b]) * i2 - (t[k, b] - t[k - 1, b]) * i1)
-            for h in range(f + 1):
+            for h in range(f, 3):
                 col = 6 * (k - 1 + h)
                 for b in range(3):
                     S[row + 3 + b, col + 3 + b] += w_move * c[f] * c[h]
@@ -315,13 +368,13 @@ def _add_pose_terms(S: Float, g: Float, R: Float, t: Float, p: Problem) -> None:
 
 @njit(cache=True, nogil=True)
 def _add_observations(
-    i: int, S: Float, g: Float, V: Float, b: Float, C: Float, R: Float, t: Float, X: Float, p: Problem
-) -> bool:
+    i: int, S: Float, g: Float, V: Float, b: Float, C: Float, R: Float, t: Float, X: Float, p: Problem,
+    r: Float, J: Float, J_point: Float,
+) -> bool:  # fmt: skip
     """Terms of point i: poses into S and g, the point into V (3, 3) and b (3,), the mixed block into C (W, 6, 3).
 
-    Returns False when nothing sees the point.
+    Returns False when nothing sees the point. The last three arguments are scratch space.
     """
-    r, J, J_point = np.empty(2), np.empty((2, 6)), np.empty((2, 3))
     V[:], b[:], C[:] = 0.0, 0.0, 0.0
     any_seen = False
     for k in range(len(R)):
@@ -333,7 +386,7 @@ def _add_observations(
         for a in range(6):
             w0, w1 = w * J[0, a], w * J[1, a]
             g[o + a] -= w0 * r[0] + w1 * r[1]
-            for c in range(a + 1):
+            for c in range(a, 6):
                 S[o + a, o + c] += w0 * J[0, c] + w1 * J[1, c]
             for c in range(3):
                 C[k, a, c] = w0 * J_point[0, c] + w1 * J_point[1, c]
@@ -369,10 +422,13 @@ def _eliminate(i: int, S: Float, g: Float, L: Float, b: Float, C: Float, Y: Floa
     for k in range(W):
         if not p.seen[k, i]:
             continue
-        for row in range(6 * k, 6 * k + 6):
-            v0, v1, v2 = Y[0, row], Y[1, row], Y[2, row]
-            for col in range(6 * k + 6):
-                S[row, col] -= v0 * Y[0, col] + v1 * Y[1, col] + v2 * Y[2, col]
+        # Views that begin at the diagonal block: indices that start at zero are what the compiler can vectorise.
+        Y0, Y1, Y2 = Y[0, 6 * k :], Y[1, 6 * k :], Y[2, 6 * k :]
+        for a in range(6):
+            row = S[6 * k + a, 6 * k :]
+            v0, v1, v2 = Y0[a], Y1[a], Y2[a]
+            for c in range(len(row)):
+                row[c] -= v0 * Y0[c] + v1 * Y1[c] + v2 * Y2[c]
 
 
 @njit(cache=True, nogil=True)
@@ -411,6 +467,7 @@ def adjust_window(R: Float, t: Float, X: Float, p: Problem, n_iterations: int) -
     S, g, Y = np.empty((n, n)), np.empty(n), np.empty((3, n))
     V, b, C = np.empty((N, 3, 3)), np.empty((N, 3)), np.empty((N, W, 6, 3))
     solved = np.empty(N, np.bool_)
+    r, J, J_point = np.empty(2), np.empty((2, 6)), np.empty((2, 3))
     R_new, t_new = np.empty_like(R), np.empty_like(t)
     covariance = np.full((12, 12), np.inf)
     damping = _FIRST_DAMPING
@@ -419,7 +476,7 @@ def adjust_window(R: Float, t: Float, X: Float, p: Problem, n_iterations: int) -
         S[:], g[:] = 0.0, 0.0
         for i in range(N):
             solved[i] = False
-            if not _add_observations(i, S, g, V[i], b[i], C[i], R, t, X, p):
+            if not _add_observations(i, S, g, V[i], b[i], C[i], R, t, X, p, r, J, J_point):
                 continue
             ridge = 1e-9 * (V[i, 0, 0] + V[i, 1, 1] + V[i, 2, 2])
             for a in range(3):
@@ -431,10 +488,10 @@ def adjust_window(R: Float, t: Float, X: Float, p: Problem, n_iterations: int) -
         _add_pose_terms(S, g, R, t, p)
         for a in range(n):
             S[a, a] += damping * S[a, a] + 1e-9
-        if not cholesky_in_place(S):
+        if not _factor_system(S):
             damping *= 100.0
             continue
-        step = cholesky_solve(S, g)
+        step = _solve_system(S, g)
         for k in range(W):
             R_new[k] = product(rotation(step[6 * k : 6 * k + 3]), R[k])
             t_new[k] = t[k] + step[6 * k + 3 : 6 * k + 6]
@@ -444,10 +501,8 @@ def adjust_window(R: Float, t: Float, X: Float, p: Problem, n_iterations: int) -
             damping *= 10.0
             continue
         R[:], t[:], X[:] = R_new, t_new, X_new
-        for a in range(12):
-            unit = np.zeros(n)
-            unit[n - 12 + a] = 1.0
-            covariance[a] = cholesky_solve(S, unit)[n - 12 :]
+        # The last block of the inverse needs only the last block of the factor.
+        covariance = _inverse_of_square(S[n - 12 :, n - 12 :])
         damping = max(0.2 * damping, 1e-6)
         gain, cost = cost - new_cost, new_cost
         if gain < 1e-4 * cost:
