@@ -250,9 +250,9 @@ class Offline:
         for index, step in enumerate(steps):
             row, covariance = self._refined(index, rows[index])
             state = TrackState.TRACKING if np.isfinite(row).all() else TrackState.LOST
-            chosen = int(result.chosen[index])
+            decided = {"anchor": int(result.chosen[index]), "gate_weight": float(result.gate_weight[index])}
             estimates.append(
-                replace(step.estimate, state=state, pose_row=row, covariance=covariance, anchor=chosen, gap_frames=0)
+                replace(step.estimate, state=state, pose_row=row, covariance=covariance, gap_frames=0, **decided)
             )
         return estimates
 

@@ -13,6 +13,7 @@ import numpy as np
 from hat_ros import lie
 from hat_ros.config import AlignmentConfig, FusionConfig
 from hat_ros.core.alignment import SlamAlignment
+from hat_ros.core.inertia import InertialPrior
 from hat_ros.core.pose_solver import PoseProblem, solve_pose
 from hat_ros.types import Float, Motion
 
@@ -52,6 +53,7 @@ class CausalFusion:
         self._lever_m_per_rad = alignment.lever_m_per_rad
         self.alignment = SlamAlignment(alignment)
         self._dissent = Dissent(fusion.gate_angle_deg, alignment.reset_anchors)
+        self._inertia = InertialPrior(fusion.inertial_weight, fusion.relative_weight)
         self._epoch = 0
         self._previous: tuple[Float | None, Motion] = (None, Motion.none())
 
@@ -110,10 +112,8 @@ class CausalFusion:
     def _predict(self, motion: Motion) -> Float | None:
         """Delta S applied to the previous frame's output; None unless that and both SLAM poses exist."""
         output, previous = self._previous
-        if output is None:
-            return None
-        step = relative_motion(previous, motion, self.alignment.current.scale)
-        return None if step is None else step @ output
+        step = None if output is None else relative_motion(previous, motion, self.alignment.current.scale)
+        return self._inertia.smooth(output, None if step is None else step @ output)
 
 
 class Dissent:

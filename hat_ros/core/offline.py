@@ -22,6 +22,9 @@ from hat_ros.core.pose_graph import PoseGraph
 from hat_ros.core.selector import RunningGate, box_area_px, motion_penalty, scaled_score
 from hat_ros.types import Candidates, Float, Motion
 
+# Random rotations agree within 75 degrees one time in nine, so motion that fits nothing links a fifth of the anchors.
+_CREDIBLE_SHARE = 1.0 / 3.0
+
 
 @dataclass(frozen=True)
 class OfflineResult:
@@ -72,8 +75,8 @@ def consistent(anchors: Sequence[Float], motions: Sequence[Motion], config: HatC
     A history passes through anchors in order. Each one counts one; going on to an anchor whose rotation, propagated by
     the motion, is more than D away costs ``reset_anchors``, so a rotation basin is entered only where enough anchors
     stand for it. (The causal reset by four coherent anchors, in both directions of time. Only neighbours in the history
-    are compared, so the motion may drift.) If even the longest history leaves out most anchors, it is the motion that
-    cannot be believed, and all are kept.
+    are compared, so the motion may drift.) If even the longest holds less than a third of the
+    anchors, it is the motion that cannot be believed, and all are kept.
 
     Args:
         anchors: n poses ``T_cam_target`` (4, 4) in order.
@@ -98,7 +101,7 @@ def consistent(anchors: Sequence[Float], motions: Sequence[Motion], config: HatC
     while at >= 0:
         kept[at] = True
         at = int(before[at])
-    return kept if 2 * np.count_nonzero(kept) >= n else np.ones(n, dtype=bool)
+    return kept if np.count_nonzero(kept) >= _CREDIBLE_SHARE * n else np.ones(n, dtype=bool)
 
 
 def backtrace(candidates: Sequence[Candidates], motions: Sequence[Motion], config: SelectorConfig) -> NDArray[np.int64]:

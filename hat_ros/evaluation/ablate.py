@@ -171,20 +171,25 @@ def tables(plan: Plan, outcomes: Sequence[Outcome]) -> dict[str, Table]:
 
 
 def component_rows(config: HatConfig) -> list[Row]:
-    """The cumulative component table (paper, Table "Cumulative component ablations")."""
+    """The cumulative component table (paper, Table "Cumulative component ablations"), and the inertial prior.
+
+    The prior weighs as much as relative motion where the configuration has it off.
+    """
     fusion_only = _with(
         config,
         selector={"motion_weight_per_deg": 0.0, "running_gate": False, "size_weighting": False},
-        fusion={"gate_angle_deg": GATE_OFF_DEG},
+        fusion={"gate_angle_deg": GATE_OFF_DEG, "inertial_weight": 0.0},
     )
     viterbi = replace(fusion_only, selector=replace(config.selector, size_weighting=False))
     sized = replace(viterbi, selector=replace(config.selector, size_weighting=True))
     gated = _with(sized, fusion={"gate_angle_deg": config.fusion.gate_angle_deg})
+    inertia = config.fusion.inertial_weight or config.fusion.relative_weight
     return [
         Row("keyframe anchors + SLAM fusion", _causal(fusion_only)),
         Row("+ Viterbi basin selection", _causal(viterbi)),
         Row("+ size-weighted unary", _causal(sized)),
         Row(f"+ disagreement gate (D = {config.fusion.gate_angle_deg:g} deg)", _causal(gated)),
+        Row(f"+ inertial prior (v = {inertia:g})", _causal(_with(gated, fusion={"inertial_weight": inertia}))),
     ]
 
 

@@ -84,6 +84,7 @@ def replay_offline(log: RunLog, config: HatConfig) -> RunLog:
             keyframe=len(candidates[i]) > 0,
             n_candidates=len(candidates[i]),
             anchor=int(result.chosen[i]),
+            gate_weight=float(result.gate_weight[i]),
             slam_epoch=motions[i].epoch,
         )
         builder.add(candidates[i], motions[i], estimate)
