@@ -36,6 +36,7 @@ class KeyframeConfig:
     """When candidates are generated."""
 
     gap_frames: int = option(6, "frames from one anchor attempt to the next", low=1)
+    settled_factor: int = option(1, "the gap is this many times as long while the track is settled", low=1)
 
 
 @dataclass(frozen=True)

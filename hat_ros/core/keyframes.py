@@ -1,8 +1,11 @@
-"""When the absolute estimator is asked: anchor opportunities at a fixed spacing of input frames (paper, Stage 2)."""
+"""When the absolute estimator is asked: anchor opportunities at a spacing of input frames (paper, Stage 2)."""
 
 from __future__ import annotations
 
 from hat_ros.config import KeyframeConfig
+
+# Attempts in a row that must have met a healthy track before it counts as settled: as many as the decoder warms up for.
+SETTLING_ATTEMPTS = 3
 
 
 class KeyframeSchedule:
@@ -10,20 +13,35 @@ class KeyframeSchedule:
 
     An attempt counts even when every candidate is rejected later. Without a detection there is no attempt: the
     opportunity stays open for the next frame that has one.
+
+    Our extension: while a track is settled, an absolute estimate has little to add, and the gap is
+    ``settled_factor`` times as long. The paper's spacing is a factor of 1.
     """
 
     def __init__(self, config: KeyframeConfig) -> None:
         self._gap_frames = config.gap_frames
+        self._settled_gap_frames = config.gap_frames * config.settled_factor
         self.reset()
 
-    def update(self, has_detection: bool) -> bool:
-        """Count one input frame; True when candidates are to be generated for it."""
+    def update(self, has_detection: bool, healthy: bool = False) -> bool:
+        """Count one input frame; True when candidates are to be generated for it.
+
+        Args:
+            has_detection: the target has been found in the image.
+            healthy: the fused state of the past, as the prior of this frame tells it, is TRACKING.
+        """
         self._frames_since_attempt += 1
-        if not has_detection or self._frames_since_attempt < self._gap_frames:
+        if not healthy:
+            self._healthy_attempts = 0
+        settled = self._healthy_attempts >= SETTLING_ATTEMPTS
+        gap_frames = self._settled_gap_frames if settled else self._gap_frames
+        if not has_detection or self._frames_since_attempt < gap_frames:
             return False
         self._frames_since_attempt = 0
+        self._healthy_attempts += healthy
         return True
 
     def reset(self) -> None:
         """The next frame with a detection is an opportunity."""
         self._frames_since_attempt = self._gap_frames
+        self._healthy_attempts = 0

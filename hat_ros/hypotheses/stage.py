@@ -30,7 +30,8 @@ class HypothesisStage:
         Raises:
             CandidateError: the backend returned a score or pose that is not finite and ``hypotheses.guard`` is off.
         """
-        if not self._schedule.update(detection is not None) or detection is None:
+        healthy = prior is not None and prior.healthy
+        if not self._schedule.update(detection is not None, healthy) or detection is None:
             return Candidates.none()
         candidates = self._backend.generate(frame, detection, prior)
         if len(candidates) > self._max_candidates:

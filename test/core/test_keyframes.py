@@ -29,3 +29,16 @@ def test_a_reset_makes_the_next_detection_an_opportunity():
     schedule.reset()
     assert not schedule.update(False)
     assert schedule.update(True)
+
+
+def test_a_settled_track_is_asked_less_often_until_it_is_in_doubt():
+    schedule = KeyframeSchedule(KeyframeConfig(gap_frames=4, settled_factor=3))
+    healthy = [2 <= i < 42 for i in range(60)]
+    asked = [i for i in range(60) if schedule.update(True, healthy[i])]
+    # Frame 0 is not healthy yet; 4, 8 and 12 settle it; doubt at 42 asks again at once, its gap being over.
+    assert asked == [0, 4, 8, 12, 24, 36, 42, 46, 50, 54, 58]
+
+
+def test_health_changes_nothing_with_a_factor_of_one():
+    schedule = KeyframeSchedule(KeyframeConfig(gap_frames=4))
+    assert [i for i in range(20) if schedule.update(True, True)] == list(range(0, 20, 4))
