@@ -33,7 +33,7 @@ setup(
     ],
     extras_require={
         "ros": ["ros-jazzy-rclpy==7.1.6", "ros-jazzy-common-interfaces==5.3.6", "ros-rclpy[fastrtps]==7.1.6"],
-        "nets": ["torch==2.13.0", "transformers>=4.45", "safetensors>=0.4"],
+        "nets": ["torch==2.13.0", "transformers>=5.23", "safetensors>=0.4"],
         "gl": ["pyrender==0.1.45"],
         "cluster": ["distributed>=2024.1"],
     },

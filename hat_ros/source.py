@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hat_ros import lie
 from hat_ros.bag import BagReader, deserialize
 from hat_ros.datasets.image_files import ImageRecording
-from hat_ros.datasets.importer import open_dataset
+from hat_ros.datasets.importer import open_dataset, with_annotation_boxes, with_detections
 from hat_ros.datasets.sequence import load_sequence
 from hat_ros.errors import BagError, DatasetError, FrameError, UsageError
 from hat_ros.nodes.images import decode_image, decode_mask
@@ -32,12 +32,14 @@ class SourceSpec:
         dataset: layout of the data set (``spark``, ``shirt``, ...); empty = ``path`` is one recording.
         sequence: name of the sequence within the data set.
         model: CAD model, for data sets that bring none.
+        detections: masks or boxes of this sequence computed elsewhere, see ``datasets.importer.with_detections``.
     """
 
     path: Path
     dataset: str = ""
     sequence: str = ""
     model: Path | None = None
+    detections: Path | None = None
 
     @property
     def name(self) -> str:
@@ -52,7 +54,7 @@ class SourceSpec:
     def sha256(self) -> str:
         """Digest of everything that the recording is made of."""
         if not self.dataset:
-            return input_hash(self.path)
+            return input_hash(self.path) if self.detections is None else self._with_detections(input_hash(self.path))
         recording = self._in_dataset()
         digest = hashlib.sha256(recording.camera.K.tobytes() + recording.distortion.tobytes())
         for item in recording.files:
@@ -62,7 +64,10 @@ class SourceSpec:
             for path in (item.image, *item.masks):
                 digest.update(input_hash(path).encode())
         digest.update(input_hash(recording.target_path).encode())
-        return digest.hexdigest()
+        return digest.hexdigest() if self.detections is None else self._with_detections(digest.hexdigest())
+
+    def _with_detections(self, rest: str) -> str:
+        return hashlib.sha256(f"{rest}{input_hash(self.detections)}".encode()).hexdigest()
 
     def open(self) -> Source:
         """Open the recording and its CAD model.
@@ -73,11 +78,14 @@ class SourceSpec:
         """
         if self.dataset:
             return _source_of_images(self.path, self._in_dataset())
-        return open_source(self.path)
+        return open_source(self.path, self.detections)
 
     def _in_dataset(self) -> ImageRecording:
         for recording in open_dataset(self.dataset, self.path, self.model, (self.sequence,)):
-            return recording
+            if self.detections is not None:
+                return with_detections(recording, self.detections)
+            # SHIRT has neither masks nor a published detector: the paper takes the regions from the labels.
+            return with_annotation_boxes(recording) if self.dataset == "shirt" else recording
         raise DatasetError(f"{self.path}: no sequence named {self.sequence}")
 
 
@@ -124,15 +132,18 @@ def _attempts(bag: BagReader) -> Iterator[Frame | FrameError]:
             yield error
 
 
-def open_source(path: str | Path) -> Source:
+def open_source(path: str | Path, detections: Path | None = None) -> Source:
     """Open a bag or a folder of the ``sequence`` layout, and the CAD model beside it; see :meth:`SourceSpec.open`."""
     path = Path(path)
     if not path.exists():
         raise UsageError(f"recording {path}: no such file or folder")
     if (path / "labels.json").is_file():
-        return _source_of_images(path, load_sequence(path))
+        recording = load_sequence(path)
+        return _source_of_images(path, recording if detections is None else with_detections(recording, detections))
     if path.suffix != ".mcap" and not (path / "metadata.yaml").is_file():
         raise UsageError(f"recording {path}: neither a bag (metadata.yaml) nor a sequence folder (labels.json)")
+    if detections is not None:
+        raise UsageError(f"recording {path}: a bag has its detections in it; give --detections to `hat import`")
     bag = BagReader(path)
     if bag.target_path is None:
         raise BagError(f"{path} has no target.yaml: put the CAD model and a target.yaml that names it into the folder")

@@ -1,6 +1,7 @@
 """Where recordings come from: data sets as published are read without writing a bag."""
 
 import csv
+import json
 
 import cv2
 import numpy as np
@@ -82,3 +83,42 @@ def test_incomplete_data_set_options_are_exit_code_2(spark, capsys, arguments, s
     root, _ = spark
     assert main([text.format(root=root) for text in arguments]) == 2
     assert sentence in capsys.readouterr().err
+
+
+def test_detections_computed_elsewhere_are_used_in_place(spark, tmp_path):
+    root, model = spark
+    folder = tmp_path / "detections"
+    folder.mkdir()
+    for name, left in (("RT500", 100), ("RT501", 200)):
+        (folder / f"{name}.json").write_text(json.dumps({"img001.jpg": [left, 50, left + 40, 80]}))
+    clips = clips_of_dataset("spark", root, model, (), folder)
+    for (spec, _), left in zip(clips, (100, 200), strict=True):
+        first, second = (frame.given_mask for frame in spec.open().frames())
+        assert first is None
+        assert np.flatnonzero((second == 128).any(axis=0))[[0, -1]].tolist() == [left, left + 39]
+    (job, _) = bench_jobs(clips, ["hat"], ["given"], [0], "default")
+    assert f"--detections {folder}/RT500.json" in " ".join(job.command(tmp_path))
+    spec = clips[0][0]
+    before = spec.sha256()
+    (folder / "RT500.json").write_text(json.dumps({"img001.jpg": [0, 0, 40, 80]}))
+    assert spec.sha256() != before != SourceSpec(root, "spark", "RT500", model).sha256()
+
+
+def test_a_bag_has_its_detections_in_it(tmp_path):
+    (tmp_path / "metadata.yaml").write_text("")
+    with pytest.raises(UsageError, match="hat import"):
+        SourceSpec(tmp_path, detections=tmp_path / "boxes.json").open()
+
+
+def test_shirt_regions_come_from_its_labels(tmp_path):
+    root = tmp_path / "shirt"
+    (root / "roe1" / "synthetic" / "images").mkdir(parents=True)
+    cv2.imwrite(str(root / "roe1" / "synthetic" / "images" / "img1.jpg"), np.zeros((120, 160, 3), np.uint8))
+    calibration = {"cameraMatrix": [[300, 0, 80], [0, 300, 60], [0, 0, 1]], "distCoeffs": [], "Nu": 160, "Nv": 120}
+    (root / "camera.json").write_text(json.dumps(calibration))
+    label = {"filename": "img1.jpg", "q_vbs2tango_true": [1, 0, 0, 0], "r_Vo2To_vbs_true": [0, 0, 4]}
+    (root / "roe1" / "roe1.json").write_text(json.dumps([label]))
+    write_model("cubesat", tmp_path / "cubesat.glb")
+    source = SourceSpec(root, "shirt", "roe1_synthetic", tmp_path / "cubesat.glb").open()
+    (frame,) = source.frames()
+    assert set(np.unique(frame.given_mask)) == {0, 128}

@@ -93,9 +93,13 @@ def _clips(arguments: argparse.Namespace) -> list[tuple[SourceSpec, tuple[str, .
 
     if bool(arguments.dataset) != (arguments.root is not None):
         raise UsageError("--dataset and --root belong together: name the layout and the folder of the data set")
+    if arguments.detections is not None and not arguments.dataset:
+        raise UsageError("--detections belong to the --dataset; import a clip with its own (`hat import --detections`)")
     clips = clips_named(arguments.recordings)
     if arguments.dataset:
-        clips += clips_of_dataset(arguments.dataset, arguments.root, arguments.model, arguments.sequence)
+        clips += clips_of_dataset(
+            arguments.dataset, arguments.root, arguments.model, arguments.sequence, arguments.detections
+        )
     if not clips:
         raise UsageError("nothing to run: name bags or sequence folders, or a --dataset and its --root")
     return clips

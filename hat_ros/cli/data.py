@@ -39,10 +39,19 @@ def _add_import(commands: Commands) -> None:
     parser.add_argument(
         "--sequence", action="append", default=[], metavar="NAME", help="only this sequence (repeatable)"
     )
-    parser.add_argument(
+    regions = parser.add_mutually_exclusive_group()
+    regions.add_argument(
         "--boxes",
         action="store_true",
         help="give frames without a mask the box of the CAD at the true pose (as for SHIRT)",
+    )
+    regions.add_argument(
+        "--detections",
+        type=Path,
+        metavar="PATH",
+        help="masks or boxes computed elsewhere, instead of the data set's own: JSON as from CNOS (run lengths or "
+        "bbox), JSON of boxes by file name, or a folder of mask images; for several sequences a folder with NAME.json "
+        "or NAME/ for each",
     )
     parser.add_argument("--check", action="store_true", help="also write a picture of the CAD projected by the labels")
     parser.add_argument("--renderer", choices=("embree", "pyrender"), default="embree", help="what draws that picture")
@@ -62,6 +71,7 @@ def _import(arguments: argparse.Namespace) -> int:
             model=arguments.model,
             sequences=arguments.sequence,
             boxes=arguments.boxes,
+            detections=arguments.detections,
             check=arguments.check,
             renderer=arguments.renderer,
             progress=watch,

@@ -47,7 +47,7 @@ def add_out(parser: argparse.ArgumentParser, what: str) -> None:
 
 
 def add_dataset(parser: argparse.ArgumentParser) -> None:
-    """``--dataset`` and ``--model``."""
+    """``--dataset``, ``--model`` and ``--detections``."""
     parser.add_argument(
         "--dataset",
         choices=FORMATS,
@@ -56,6 +56,12 @@ def add_dataset(parser: argparse.ArgumentParser) -> None:
         help=f"the recording is a sequence of a data set as published: {', '.join(FORMATS)}",
     )
     parser.add_argument("--model", type=Path, metavar="CAD", help="metric CAD model, for data sets that bring none")
+    parser.add_argument(
+        "--detections",
+        type=Path,
+        metavar="PATH",
+        help="masks or boxes computed elsewhere, for --set segmentation.backend=annotated; see `hat import --help`",
+    )
 
 
 def add_threads(parser: argparse.ArgumentParser) -> None:

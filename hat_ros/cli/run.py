@@ -132,7 +132,7 @@ def _track(arguments: argparse.Namespace) -> int:
 
     if bool(arguments.dataset) != bool(arguments.sequence):
         raise UsageError("track: --dataset and --sequence belong together: name the layout and one of its sequences")
-    spec = SourceSpec(arguments.recording, arguments.dataset, arguments.sequence, arguments.model)
+    spec = SourceSpec(arguments.recording, arguments.dataset, arguments.sequence, arguments.model, arguments.detections)
     options = TrackOptions(
         mode=arguments.mode,
         credits=arguments.credits,

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +61,8 @@ def open_bop(
             mesh = root / "models" / f"obj_{object_id:06d}.ply"
             if not mesh.is_file():
                 raise DatasetError(f"{mesh}: CAD model of object {object_id} in scene {scene.name} is missing")
-            yield read_scene(scene, name, mesh, gt, calibration, object_id, listed)
+            recording = read_scene(scene, name, mesh, gt, calibration, object_id, listed)
+            yield replace(recording, scene=(int(scene.name), object_id) if scene.name.isdigit() else None)
 
 
 def read_scene(

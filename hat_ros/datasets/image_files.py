@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -14,6 +15,9 @@ from numpy.typing import NDArray
 from hat_ros import lie
 from hat_ros.errors import DatasetError, FrameError
 from hat_ros.types import Camera, Frame
+
+if TYPE_CHECKING:
+    from hat_ros.segmentation.detections import DetectionLookup
 
 # Sequences without a clock: 10 frames a second from one second on, so that no stamp is zero.
 FIRST_STAMP_NS = 1_000_000_000
@@ -50,6 +54,9 @@ class ImageRecording:
         files: the frames in order.
         distortion: OpenCV coefficients of the files' lens; frames are undistorted to ``camera``. Empty = none.
         unit_scale: metres per unit of the CAD file.
+        detections: masks and boxes computed elsewhere, on the images as stored; where given, the files' own masks and
+            boxes do not count.
+        scene: (scene, object) numbers of a BOP data set, by which detections of many are told apart.
     """
 
     name: str
@@ -58,6 +65,8 @@ class ImageRecording:
     files: Sequence[ImageFile]
     distortion: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     unit_scale: float = 1.0
+    detections: DetectionLookup | None = None
+    scene: tuple[int, int] | None = None
 
     def __len__(self) -> int:
         return len(self.files)
@@ -78,6 +87,9 @@ class ImageRecording:
 
     def given_mask(self, item: ImageFile) -> NDArray[np.uint8] | None:
         """(H, W) uint8 as in ``Frame.given_mask``, None when the frame brings no detection at all."""
+        if self.detections is not None:
+            mask = self.detections.given_mask(item.image.name, (self.camera.height, self.camera.width))
+            return None if mask is None else self._rectify(mask, item.image, cv2.INTER_NEAREST)
         if item.masks:
             inside = np.zeros((self.camera.height, self.camera.width), bool)
             for path in item.masks:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -16,6 +16,7 @@ from hat_ros.bag import BagWriter
 from hat_ros.datasets.image_files import ImageFile, ImageRecording
 from hat_ros.errors import DatasetError, UsageError
 from hat_ros.render import create_renderer
+from hat_ros.segmentation.detections import load_detections
 from hat_ros.target import load_target
 
 # name -> opener(root, model, sequences)
@@ -69,6 +70,7 @@ def import_dataset(
     model: str | Path | None = None,
     sequences: Collection[str] = (),
     boxes: bool = False,
+    detections: str | Path | None = None,
     check: bool = False,
     renderer: str = "embree",
     progress: Progress | None = None,
@@ -81,6 +83,8 @@ def import_dataset(
         fmt: see :func:`open_dataset`, as are ``root``, ``model`` and ``sequences``.
         out: where to.
         boxes: give frames without a mask the box of the CAD at the true pose, see :func:`with_annotation_boxes`.
+        detections: masks or boxes computed elsewhere instead of the data set's own, see :func:`with_detections`; a
+            folder with ``NAME`` or ``NAME.json`` for each sequence, or what there is of the only one.
         check: also write ``NAME.check.png`` beside each bag, see :func:`check_picture`.
         renderer: what draws it, see ``render.create_renderer``.
         progress: called with (sequence, frames done, frames in all).
@@ -92,10 +96,18 @@ def import_dataset(
         UsageError, DatasetError, MeshError: see :func:`open_dataset` and ``load_target``.
         RunError: the bag cannot be written.
     """
+    if boxes and detections is not None:
+        raise UsageError("boxes from the labels and detections from elsewhere exclude each other, choose one")
     out, bags = Path(out), []
-    for recording in open_dataset(fmt, root, model, sequences):
+    recordings = open_dataset(fmt, root, model, sequences)
+    if detections is not None:  # which of them belong to a sequence depends on how many there are
+        recordings = list(recordings)
+        found = detections_by_sequence(Path(detections), recordings)
+    for recording in recordings:
         bag = out if fmt == "sequence" else out / recording.name
         if not _complete(bag):
+            if detections is not None:
+                recording = with_detections(recording, found[recording.name])
             recording = with_annotation_boxes(recording) if boxes else recording
             _write_bag(recording, bag, progress)
         elif progress is not None:
@@ -161,6 +173,44 @@ def with_annotation_boxes(recording: ImageRecording) -> ImageRecording:
                 item = replace(item, box_xyxy=np.concatenate([uv.min(axis=0), uv.max(axis=0)]))
         files.append(item)
     return replace(recording, files=files)
+
+
+def detections_by_sequence(path: Path, recordings: Sequence[ImageRecording]) -> dict[str, Path]:
+    """Sequence name -> its detections: ``path/NAME``, ``path/NAME.json``, or ``path`` itself.
+
+    ``path`` itself can only serve one sequence, or those of a BOP data set, where each detection names its scene.
+
+    Raises:
+        UsageError: there are several sequences, and one has no detections of its own.
+    """
+    found = {}
+    for recording in recordings:
+        own = (path / recording.name, path / f"{recording.name}.json")
+        found[recording.name] = next((item for item in own if item.exists()), path)
+        if found[recording.name] == path and len(recordings) > 1 and (recording.scene is None or path.is_dir()):
+            raise UsageError(
+                f"detections {path}: {len(recordings)} sequences are asked for, and there is neither {own[0].name} nor "
+                f"{own[1].name} in it; put one file or folder per sequence there, or name one --sequence"
+            )
+    return found
+
+
+def with_detections(recording: ImageRecording, path: Path) -> ImageRecording:
+    """Detections computed elsewhere in place of the data set's own masks and boxes.
+
+    Frames that have none there have none at all. They are read by ``segmentation.detections.load_detections``, land in
+    ``/detection/mask`` and are used by ``segmentation.backend=annotated`` alone.
+
+    Raises:
+        DatasetError: malformed, or not of this recording: no image of that name or number.
+    """
+    lookup = load_detections(path, recording.scene)
+    if not any(item.image.name in lookup for item in recording.files):
+        raise DatasetError(
+            f"{path}: none of its {len(lookup)} detections names an image of {recording.name}, which are called like "
+            f"{recording.files[0].image.name}"
+        )
+    return replace(recording, detections=lookup)
 
 
 def check_picture(recording: ImageRecording, width_px: int = 640, renderer_name: str = "embree") -> NDArray[np.uint8]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hat_ros.datasets.importer import open_dataset
+from hat_ros.datasets.importer import detections_by_sequence, open_dataset
 from hat_ros.errors import UsageError
 from hat_ros.evaluation import metrics
 from hat_ros.evaluation.campaign import Job, Outcome
@@ -78,16 +78,18 @@ def clips_named(texts: Sequence[str]) -> list[tuple[SourceSpec, tuple[str, ...]]
 
 
 def clips_of_dataset(
-    dataset: str, root: Path, model: Path | None, sequences: Sequence[str]
+    dataset: str, root: Path, model: Path | None, sequences: Sequence[str], detections: Path | None = None
 ) -> list[tuple[SourceSpec, tuple[str, ...]]]:
-    """The sequences of a data set as published, without writing bags.
+    """The sequences of a data set as published, without writing bags; each with its detections, if any are given.
 
     Raises:
         UsageError, DatasetError: see :func:`hat_ros.datasets.importer.open_dataset`.
     """
     root, model = root.resolve(), model and model.resolve()
-    names = [recording.name for recording in open_dataset(dataset, root, model, sequences)]
-    return [(SourceSpec(root, dataset, name, model), ()) for name in names]
+    recordings = list(open_dataset(dataset, root, model, sequences))
+    found = {} if detections is None else detections_by_sequence(detections.resolve(), recordings)
+    names = [recording.name for recording in recordings]
+    return [(SourceSpec(root, dataset, name, model, found.get(name)), ()) for name in names]
 
 
 def bench_jobs(

@@ -78,6 +78,8 @@ class Job:
             command += ["--dataset", self.spec.dataset, "--sequence", self.spec.sequence]
         if self.spec.model is not None:
             command += ["--model", str(self.spec.model)]
+        if self.spec.detections is not None:
+            command += ["--detections", str(self.spec.detections)]
         if self.limit is not None:
             command += ["--limit", str(self.limit)]
         for override in self.overrides:

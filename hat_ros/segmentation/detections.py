@@ -4,7 +4,8 @@ Three layouts are understood, told apart by what is found, never by a guess at a
 
 * a JSON list in the style of the BOP challenge and CNOS: ``{"image_id": int or file name, "score": float, ...}`` with
   ``segmentation`` (COCO run lengths, ``{"size": [H, W], "counts": [...] or compressed string}``) and/or ``bbox``
-  ``[x, y, w, h]`` in pixels; the best score per image counts;
+  ``[x, y, w, h]`` in pixels; the best score per image counts. ``scene_id`` and ``category_id`` tell scenes and objects
+  of one file apart;
 * a JSON mapping from file name (or number) to a box ``[x0, y0, x1, y1]`` in pixels, outer pixel edges;
 * a folder of mask images, one per frame under the frame's file name: white = silhouette (a uniform grey 128 = box).
 
@@ -47,6 +48,9 @@ class DetectionLookup:
     def __len__(self) -> int:
         return len(self._entries)
 
+    def __contains__(self, name: str | int) -> bool:
+        return _key(name) in self._entries
+
     def given_mask(self, name: str | int, size: tuple[int, int]) -> Mask | None:
         """The (H, W) uint8 mask of a frame as in ``Frame.given_mask``; None when the frame has no detection.
 
@@ -69,11 +73,16 @@ class DetectionLookup:
         return mask
 
 
-def load_detections(path: str | Path) -> DetectionLookup:
+def load_detections(path: str | Path, scene: tuple[int, int] | None = None) -> DetectionLookup:
     """Read a file or folder of detections; masks are decoded only when asked for.
 
+    Args:
+        path: the file or folder.
+        scene: (scene, object) of a BOP data set: detections that name another ``scene_id`` or ``category_id`` are left
+            out. None takes all, which must then be of one scene.
+
     Raises:
-        DatasetError: nothing there, not one of the three layouts, or malformed.
+        DatasetError: nothing there, not one of the three layouts, malformed, or of several scenes.
     """
     path = Path(path)
     if path.is_dir():
@@ -87,7 +96,7 @@ def load_detections(path: str | Path) -> DetectionLookup:
     except (ValueError, RecursionError) as error:
         raise DatasetError(f"{path}: not valid JSON ({' '.join(str(error).split())})") from None
     if isinstance(data, list):
-        return _from_bop_list(data, path)
+        return _from_bop_list(data, path, scene)
     if isinstance(data, dict):
         return _from_box_mapping(data, path)
     raise DatasetError(f"{path}: expected a list of detections or a mapping of boxes, found {type(data).__name__}")
@@ -121,22 +130,21 @@ def _read_mask(file: Path) -> Mask:
     return np.where(image > threshold, SILHOUETTE, 0).astype(np.uint8)
 
 
-def _from_bop_list(data: list[Any], path: Path) -> DetectionLookup:
+def _from_bop_list(data: list[Any], path: Path, scene: tuple[int, int] | None) -> DetectionLookup:
     best: dict[str, tuple[float, dict[str, Any]]] = {}
+    scenes = set()
     for index, item in enumerate(data):
-        where = f"{path}: detection {index}"
-        if not isinstance(item, dict) or "image_id" not in item:
-            raise DatasetError(f"{where}: expected a mapping with 'image_id' and 'segmentation' or 'bbox'")
-        image_id, score = item["image_id"], item.get("score", 1.0)
-        if isinstance(image_id, bool) or not isinstance(image_id, (int, str)):
-            raise DatasetError(f"{where}: image_id must be a number or a file name, found {image_id!r}")
-        if isinstance(score, bool) or not isinstance(score, (int, float)) or not math.isfinite(score):
-            raise DatasetError(f"{where}: score must be a finite number, found {score!r}")
-        if item.get("segmentation") is None and item.get("bbox") is None:
-            raise DatasetError(f"{where}: it has neither 'segmentation' nor 'bbox'")
-        key = _key(image_id)
+        key, score = _checked(item, f"{path}: detection {index}")
+        if scene is not None and (item.get("scene_id", scene[0]), item.get("category_id", scene[1])) != scene:
+            continue
+        scenes.add(str(item.get("scene_id", "")))
         if key not in best or score > best[key][0]:
-            best[key] = (float(score), item)
+            best[key] = (score, item)
+    if len(scenes) > 1:
+        names = ", ".join(sorted(scenes)[:3])
+        raise DatasetError(
+            f"{path}: these are detections of {len(scenes)} scenes ({names} ...); give one scene's alone"
+        )
     entries: dict[str, Callable[[tuple[int, int]], Mask]] = {}
     for key, (_, item) in best.items():
         where = f"{path}: image {item['image_id']}"
@@ -146,6 +154,20 @@ def _from_bop_list(data: list[Any], path: Path) -> DetectionLookup:
             x, y, w, h = _four_numbers(item["bbox"], where)
             entries[key] = lambda size, box=(x, y, x + w, y + h), where=where: _box_mask(box, size, where)
     return DetectionLookup(entries, path)
+
+
+def _checked(item: Any, where: str) -> tuple[str, float]:
+    """Frame key and score of one entry of a list."""
+    if not isinstance(item, dict) or "image_id" not in item:
+        raise DatasetError(f"{where}: expected a mapping with 'image_id' and 'segmentation' or 'bbox'")
+    image_id, score = item["image_id"], item.get("score", 1.0)
+    if isinstance(image_id, bool) or not isinstance(image_id, (int, str)):
+        raise DatasetError(f"{where}: image_id must be a number or a file name, found {image_id!r}")
+    if isinstance(score, bool) or not isinstance(score, (int, float)) or not math.isfinite(score):
+        raise DatasetError(f"{where}: score must be a finite number, found {score!r}")
+    if item.get("segmentation") is None and item.get("bbox") is None:
+        raise DatasetError(f"{where}: it has neither 'segmentation' nor 'bbox'")
+    return _key(image_id), float(score)
 
 
 def _from_box_mapping(data: dict[str, Any], path: Path) -> DetectionLookup:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from transformers import Mask2FormerForUniversalSegmentation, Mask2FormerImageProcessor
+from transformers import Mask2FormerForUniversalSegmentation, Mask2FormerImageProcessorPil
 
 from hat_ros.config import HatConfig, Mask2FormerConfig
 from hat_ros.errors import WeightsError
@@ -126,9 +126,9 @@ def _compactness(mask: NDArray[np.bool_]) -> float:
     return min(np.count_nonzero(mask) / max(hull, 1.0), 1.0)
 
 
-def _load(folder: Path) -> tuple[Mask2FormerImageProcessor, Mask2FormerForUniversalSegmentation]:
+def _load(folder: Path) -> tuple[Mask2FormerImageProcessorPil, Mask2FormerForUniversalSegmentation]:
     try:
-        processor = Mask2FormerImageProcessor.from_pretrained(folder, local_files_only=True)
+        processor = Mask2FormerImageProcessorPil.from_pretrained(folder, local_files_only=True)
         model = Mask2FormerForUniversalSegmentation.from_pretrained(folder, local_files_only=True, use_safetensors=True)
     except (OSError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())[:200]

@@ -464,3 +464,130 @@ def test_principal_point_counted_from_the_corner_is_moved_to_pixel_centres(cx, e
     matrix = K.copy()
     matrix[:2, 2] = cx, 60.0
     assert camera_from_label(matrix, (160, 120), "test").K[0, 2] == expected
+
+
+# ---------------------------------------------------------------- detections computed elsewhere
+
+
+def rle_of(mask):
+    """COCO run lengths from their definition: columns, background first."""
+    flat = mask.T.ravel().astype(np.int8)
+    changes = np.flatnonzero(np.diff(np.concatenate([[0], flat])))
+    counts = np.diff(np.concatenate([[0], changes, [flat.size]])).tolist()
+    return {"size": list(mask.shape), "counts": counts}
+
+
+def spot(row, height=120, width=160):
+    mask = np.zeros((height, width), bool)
+    mask[row : row + 10, 50:90] = True
+    return mask
+
+
+def cnos(image_id, mask, **more):
+    return {"image_id": image_id, "score": 0.5, "segmentation": rle_of(mask), "bbox": [0, 0, 1, 1], **more}
+
+
+def write_json(path, data):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(data))
+    return path
+
+
+def given_masks(bag):
+    return [frame.given_mask for frame in BagReader(bag).frames()]
+
+
+def test_cnos_detections_take_the_place_of_a_sequences_masks(sequence, tmp_path):
+    path = write_json(tmp_path / "cnos.json", [cnos(0, spot(20)), cnos(2, spot(40)), cnos(2, spot(60), score=0.1)])
+    (bag,) = import_dataset("sequence", sequence, tmp_path / "bag", detections=path)
+    first, second, third = given_masks(bag)
+    np.testing.assert_array_equal(first == 255, spot(20))
+    assert second is None, "no detection there, and the recording's own mask does not step in"
+    np.testing.assert_array_equal(third == 255, spot(40))
+
+
+def test_boxes_by_file_name(sequence, tmp_path):
+    path = write_json(tmp_path / "boxes.json", {"000001.jpg": [50, 20, 90, 30]})
+    (bag,) = import_dataset("sequence", sequence, tmp_path / "bag", detections=path)
+    assert [mask is None for mask in given_masks(bag)] == [True, False, True]
+    np.testing.assert_array_equal(given_masks(bag)[1], 128 * spot(20).astype(np.uint8))
+
+
+def test_each_sequence_has_a_folder_or_file_of_its_own(spark_root, tmp_path):
+    model, height, width = save_mesh(tmp_path / "cad.ply"), spark.SIZE[1], spark.SIZE[0]
+    folder = tmp_path / "detections"
+    save(folder / "RT500" / "img001.png", 255 * spot(5, height, width).astype(np.uint8))
+    write_json(folder / "RT501.json", [cnos("img002.jpg", spot(7, height, width))])
+    bags = import_dataset("spark", spark_root, tmp_path / "bags", model=model, detections=folder)
+    found = {bag.name: [None if m is None else int(np.argmax(m[:, 60])) for m in given_masks(bag)] for bag in bags}
+    assert found == {"RT500": [None, 5, None], "RT501": [None, None, 7]}
+
+
+def test_one_file_for_several_sequences_is_refused_unless_one_is_named(spark_root, tmp_path):
+    model = save_mesh(tmp_path / "cad.ply")
+    path = write_json(tmp_path / "cnos.json", [cnos("img000.jpg", spot(5, spark.SIZE[1], spark.SIZE[0]))])
+    with pytest.raises(UsageError, match=r"neither RT500 nor RT500\.json.*--sequence"):
+        import_dataset("spark", spark_root, tmp_path / "bags", model=model, detections=path)
+    (bag,) = import_dataset("spark", spark_root, tmp_path / "bags", model=model, sequences=["RT501"], detections=path)
+    assert [mask is None for mask in given_masks(bag)] == [False, True, True]
+
+
+def test_bop_detections_are_told_apart_by_scene_and_object(bop_root, tmp_path):
+    items = [
+        cnos(0, spot(10), scene_id=48, category_id=5),
+        cnos(0, spot(30), scene_id=48, category_id=2, score=0.9),
+        cnos(0, spot(50), scene_id=49, category_id=5, score=1.0),
+    ]
+    path = write_json(tmp_path / "cnos.json", items)
+    bags = import_dataset("bop", bop_root, tmp_path / "bags", detections=path)
+    first = {bag.name: given_masks(bag)[0] for bag in bags}
+    np.testing.assert_array_equal(first["000048_obj5"] == 255, spot(10))
+    np.testing.assert_array_equal(first["000048_obj2"] == 255, spot(30))
+
+
+def test_detections_are_undistorted_with_their_images(shirt_root, tmp_path):
+    """A mask drawn where the lens puts the target comes out where the pinhole puts it."""
+    model = save_mesh(tmp_path / "cad.ply")
+    plain = next(iter(open_dataset("shirt", shirt_root, model, ["roe1_synthetic"])))
+    mask = 255 * spot(5).astype(np.uint8)
+    save(tmp_path / "masks" / "img000001.png", mask)
+    (bag,) = import_dataset(
+        "shirt", shirt_root, tmp_path / "out", model=model, sequences=["roe1_synthetic"], detections=tmp_path / "masks"
+    )
+    first, second, _ = given_masks(bag)
+    assert first is None
+    np.testing.assert_array_equal(second, plain._rectify(mask, plain.files[1].image, cv2.INTER_NEAREST))
+    assert (second != mask).any()
+
+
+def test_swisscube_detections_by_image_number(tmp_path):
+    root = tmp_path / "swisscube"
+    write_scene(root / "testing" / "seq_000400" / "000000")
+    save_mesh(root / "models" / "obj_000001.ply", (100, 60, 30))
+    path = write_json(tmp_path / "detections" / "seq_000400.json", [cnos(1, spot(15))])
+    (bag,) = import_dataset("swisscube", root, tmp_path / "bags", detections=path.parent)
+    assert [mask is None for mask in given_masks(bag)] == [True, False, True]
+
+
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [
+        ([cnos("other.png", spot(5))], r"none of its 1 detections names an image of clip.*like 000000\.jpg"),
+        ([cnos(0, spot(5, 60, 80))], "is 80x60 but the image is 160x120"),
+        ([cnos(0, spot(5), scene_id=1), cnos(1, spot(5), scene_id=2)], "detections of 2 scenes"),
+        ("{", "not valid JSON"),
+    ],
+)
+def test_detections_that_do_not_fit(sequence, tmp_path, data, says):
+    path = tmp_path / "cnos.json"
+    path.write_text(data if isinstance(data, str) else json.dumps(data))
+    with pytest.raises(DatasetError, match=says):
+        import_dataset("sequence", sequence, tmp_path / "bag", detections=path)
+    assert not (tmp_path / "bag").exists()
+
+
+def test_detections_and_boxes_from_the_labels_exclude_each_other(sequence, tmp_path):
+    with pytest.raises(UsageError, match="choose one"):
+        import_dataset("sequence", sequence, tmp_path / "bag", detections=tmp_path / "x.json", boxes=True)
+    with pytest.raises(DatasetError, match="no such file or folder of detections"):
+        import_dataset("sequence", sequence, tmp_path / "bag", detections=tmp_path / "x.json")

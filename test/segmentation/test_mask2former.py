@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from transformers import Mask2FormerConfig, Mask2FormerForUniversalSegmentation, Mask2FormerImageProcessor, SwinConfig
+from rule_weights import save_small_mask2former
 
 from hat_ros.config import config_from_dict
 from hat_ros.errors import WeightsError
@@ -68,29 +68,7 @@ def test_compact_instance_beats_scattered_one():
 
 
 def test_a_whole_network_runs_from_a_local_folder(tmp_path):
-    torch.manual_seed(0)
-    backbone = SwinConfig(
-        embed_dim=12, depths=[1, 1, 1, 1], num_heads=[1, 1, 1, 1], window_size=4,
-        out_features=["stage1", "stage2", "stage3", "stage4"],
-    )  # fmt: skip
-    network = Mask2FormerForUniversalSegmentation(
-        Mask2FormerConfig(
-            backbone_config=backbone,
-            hidden_dim=32,
-            feature_size=32,
-            mask_feature_size=32,
-            encoder_layers=1,
-            decoder_layers=2,
-            num_attention_heads=2,
-            encoder_feedforward_dim=32,
-            dim_feedforward=32,
-            num_queries=5,
-            num_labels=3,
-        )
-    )
-    folder = tmp_path / "mask2former-swin-large-coco-instance"
-    network.save_pretrained(folder)
-    Mask2FormerImageProcessor(size={"shortest_edge": 64, "longest_edge": 96}, size_divisor=32).save_pretrained(folder)
+    save_small_mask2former(tmp_path)
     config = config_from_dict(
         {"segmentation": {"mask2former": {"min_score": 0.0}}, "nets": {"weights_folder": str(tmp_path)}}
     )
