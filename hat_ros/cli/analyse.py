@@ -209,6 +209,18 @@ def _bench(arguments: argparse.Namespace) -> int:
     return 1 if failures else 0
 
 
+_ABLATE_TABLES = """\
+tables, each as NAME.txt, .csv, .tex, .json, .png and .svg below --out:
+  components    what each part of the method adds, row by row
+  sensitivity   anchor stride, K, s0, D, w: one setting at a time
+  selectors     the decoder, best appearance, a particle filter, a UKF, the offline backtrace
+  offline       independent, causal and offline poses from the same observations
+  by_clip       the same, E_p clip by clip
+  masks         motion from the masked target and from raw frames
+trace.json names the runs behind every table and the settings behind every row.
+"""
+
+
 def _add_ablate(commands: Commands) -> None:
     parser = commands.add_parser(
         "ablate",
@@ -216,6 +228,8 @@ def _add_ablate(commands: Commands) -> None:
         description="Run the front ends once per clip, then Stages 3 and 4 over what they saw under every setting of "
         "the paper's ablations. --config decides the temporal settings; --front-end, if given, takes segmentation, "
         "hypotheses and motion (and what belongs to its scores) from another preset.",
+        epilog=_ABLATE_TABLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     _add_campaign(parser)
     parser.add_argument("--front-end", metavar="NAME|FILE", help="preset of the front ends (default: that of --config)")
@@ -225,7 +239,10 @@ def _add_ablate(commands: Commands) -> None:
 def _ablate(arguments: argparse.Namespace) -> int:
     from hat_ros.cli.console import campaign_progress
     from hat_ros.evaluation import ablate
+    from hat_ros.evaluation.ablate_figure import table_figure
     from hat_ros.evaluation.campaign import run_campaign
+    from hat_ros.evaluation.figures import image_bytes
+    from hat_ros.evaluation.score import write_json
 
     out = arguments.out.resolve()
     clips = [spec for spec, _ in _clips(arguments)]
@@ -234,7 +251,10 @@ def _ablate(arguments: argparse.Namespace) -> int:
         outcomes = run_campaign(plan.jobs, out, arguments.jobs, arguments.scheduler, watch)
     for name, table in ablate.tables(plan, outcomes).items():
         table.write(out, name)
+        for form in ("png", "svg"):
+            (out / f"{name}.{form}").write_bytes(image_bytes(table_figure(table), form))
         print(table.text())
+    write_json(out / "trace.json", ablate.trace(plan, outcomes))
     failed = [f"{outcome.job.name}: {outcome.failure}" for outcome in outcomes if outcome.figures is None]
     for line in failed:
         print(f"failed: {line}", file=sys.stderr)

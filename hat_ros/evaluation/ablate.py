@@ -6,14 +6,14 @@ The front ends run once per clip (``--mode observe``, candidates at every frame)
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hat_ros.config import HatConfig, load_config
+from hat_ros.config import HatConfig, flat_options, load_config
 from hat_ros.errors import RunError, UsageError
 from hat_ros.evaluation import metrics
 from hat_ros.evaluation.campaign import Job, Outcome
@@ -21,6 +21,7 @@ from hat_ros.evaluation.filters import ParticleSelector, UkfSelector
 from hat_ros.evaluation.runlog import RunLog
 from hat_ros.evaluation.tables import Column, Table
 from hat_ros.evaluation.temporal_replay import replay_offline, replay_temporal
+from hat_ros.provenance import code_hash
 from hat_ros.result_bag import read_result_bag
 from hat_ros.results import BAG_FOLDER, CONFIG_FILE, write_config
 from hat_ros.source import SourceSpec
@@ -40,7 +41,8 @@ _RUNS = (
     ("tracking", "tracking", ()),
 )
 
-Variant = Callable[[RunLog], RunLog]
+# What may stand in Stage 3's place.
+_SELECTORS = {"viterbi": None, "particles": ParticleSelector, "ukf": UkfSelector}
 
 _ERRORS = (
     Column("E_t_m_mean", "E_t m", ".4f", r"$E_t$ (m)"),
@@ -57,12 +59,38 @@ _ANCHORS = (
 )
 
 
+_COLUMNS = (Column("name", "configuration"), *_ERRORS, *_ANCHORS)
+_BEST_APPEARANCE = {"motion_weight_per_deg": 0.0, "running_gate": False}
+
+
 @dataclass(frozen=True)
 class Row:
-    """One line of a table: what it is called and how its runs are made from the observations of a clip."""
+    """One line of a table: what it is called, and what runs over the observations of a clip.
+
+    Attributes:
+        name: for people.
+        config: temporal settings.
+        offline: the offline reference, else the causal stages.
+        selector: ``viterbi``, ``particles`` or ``ukf``.
+    """
 
     name: str
-    variant: Variant
+    config: HatConfig
+    offline: bool = False
+    selector: str = "viterbi"
+
+    def replay(self, log: RunLog) -> RunLog:
+        """The row's answer to one clip."""
+        if self.offline:
+            return replay_offline(log, self.config)
+        stand_in = _SELECTORS[self.selector]
+        return replay_temporal(log, self.config, stand_in and stand_in(self.config.selector))
+
+    def settings(self, base: HatConfig) -> dict[str, Any]:
+        """What differs from the configuration of the campaign, and what ran."""
+        usual = {key: value for key, (value, _) in flat_options(base).items()}
+        changed = {key: v for key, (v, _) in flat_options(self.config).items() if v != usual[key]}
+        return {"name": self.name, "offline": self.offline, "selector": self.selector, "settings": changed}
 
 
 @dataclass(frozen=True)
@@ -148,25 +176,54 @@ def plan(
 def tables(plan: Plan, outcomes: Sequence[Outcome]) -> dict[str, Table]:
     """All tables, by file name; clips whose runs failed are left out."""
     logs: dict[str, list[RunLog]] = {kind: [] for kind, _, _ in _RUNS}
+    clips = []
     broken = {outcome.job.labels["clip"] for outcome in outcomes if outcome.figures is None}
     for outcome in outcomes:
         if outcome.job.labels["clip"] not in broken:
             logs[outcome.job.labels["kind"]].append(read_result_bag(outcome.folder / BAG_FOLDER))
+            clips.append(outcome.job.labels["clip"])
     masked, config = logs["masked"], plan.config
     if not masked:
         return {}
-    components = table_of("Cumulative components, causal throughout", component_rows(config), masked)
+    rows = table_rows(config)
     tracking = {"name": "tracking (refine the last pose)", **pooled(logs["tracking"])}
+    components = table_of("Cumulative components, causal throughout", rows["components"], masked)
     masks = [
         {"name": name, **pooled([replay_temporal(log, config) for log in logs[kind]])}
         for name, kind in (("target masked for motion", "masked"), ("raw frames for motion", "unmasked"))
     ]
     return {
-        "components": replace(components, rows=[tracking, *components.rows]),
-        "sensitivity": table_of("Sensitivity, one setting at a time", sweep_rows(config), masked),
-        "selectors": table_of("Selection at keyframes", selector_rows(config), masked),
-        "offline": table_of("Causal and offline on the same observations", reference_rows(config), masked),
-        "masks": Table("Background masking of the motion estimate", components.columns, masks),
+        "components": with_change(replace(components, rows=[tracking, *components.rows])),
+        "sensitivity": table_of("Sensitivity, one setting at a time", rows["sensitivity"], masked),
+        "selectors": table_of("Selection at keyframes", rows["selectors"], masked),
+        "offline": table_of("Causal and offline on the same observations", rows["offline"], masked),
+        "by_clip": clip_table(rows["offline"], dict(zip(dict.fromkeys(clips), masked, strict=True))),
+        "masks": Table("Background masking of the motion estimate", _COLUMNS, masks),
+    }
+
+
+def table_rows(config: HatConfig) -> dict[str, list[Row]]:
+    """The rows that are made from the masked observations, by table."""
+    return {
+        "components": component_rows(config),
+        "sensitivity": sweep_rows(config),
+        "selectors": selector_rows(config),
+        "offline": reference_rows(config),
+    }
+
+
+def trace(plan: Plan, outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """Where every cell comes from: run folders (each with its configuration, commit and input hashes), and by row
+    what differs from ``config.yaml``. The same code over the same runs gives the same cells."""
+    rows = table_rows(plan.config)
+    return {
+        "code_sha256": code_hash(),
+        "config": CONFIG_FILE,
+        "runs": {
+            kind: [f"runs/{o.job.name}" for o in outcomes if o.job.labels["kind"] == kind and o.figures is not None]
+            for kind, _, _ in _RUNS
+        },
+        "rows": {name: [row.settings(plan.config) for row in lines] for name, lines in rows.items()},
     }
 
 
@@ -185,74 +242,83 @@ def component_rows(config: HatConfig) -> list[Row]:
     gated = _with(sized, fusion={"gate_angle_deg": config.fusion.gate_angle_deg})
     inertia = config.fusion.inertial_weight or config.fusion.relative_weight
     return [
-        Row("keyframe anchors + SLAM fusion", _causal(fusion_only)),
-        Row("+ Viterbi basin selection", _causal(viterbi)),
-        Row("+ size-weighted unary", _causal(sized)),
-        Row(f"+ disagreement gate (D = {config.fusion.gate_angle_deg:g} deg)", _causal(gated)),
-        Row(f"+ inertial prior (v = {inertia:g})", _causal(_with(gated, fusion={"inertial_weight": inertia}))),
+        Row("keyframe anchors + SLAM fusion", fusion_only),
+        Row("+ Viterbi basin selection", viterbi),
+        Row("+ size-weighted unary", sized),
+        Row(f"+ disagreement gate (D = {config.fusion.gate_angle_deg:g} deg)", gated),
+        Row(f"+ inertial prior (v = {inertia:g})", _with(gated, fusion={"inertial_weight": inertia})),
     ]
 
 
 def sweep_rows(config: HatConfig) -> list[Row]:
     """The sensitivity sweeps (paper, Sec. "Hyperparameter Sensitivity"): one setting varied at a time."""
+    five = {"max_candidates": 5}
     rows = [
-        Row(
-            f"stride {gap}, K = 5",
-            _causal(_with(config, keyframes={"gap_frames": gap}, hypotheses={"max_candidates": 5})),
-        )
-        for gap in STRIDES
+        Row(f"stride {gap}, K = 5", _with(config, keyframes={"gap_frames": gap}, hypotheses=five)) for gap in STRIDES
     ]
-    rows += [Row(f"K = {k}", _causal(_with(config, hypotheses={"max_candidates": k}))) for k in CANDIDATE_COUNTS]
+    rows += [Row(f"K = {k}", _with(config, hypotheses={"max_candidates": k})) for k in CANDIDATE_COUNTS]
     rows += [
-        Row(f"s0 = {s0:g} px", _causal(_with(config, selector={"size_weighting": True, "size_ref_px": s0})))
+        Row(f"s0 = {s0:g} px", _with(config, selector={"size_weighting": True, "size_ref_px": s0}))
         for s0 in SIZE_REFERENCES_PX
     ]
-    rows.append(Row("no size weight", _causal(_with(config, selector={"size_weighting": False}))))
+    rows.append(Row("no size weight", _with(config, selector={"size_weighting": False})))
     rows += [
-        Row(
-            "D off" if angle == GATE_OFF_DEG else f"D = {angle:g} deg",
-            _causal(_with(config, fusion={"gate_angle_deg": angle})),
-        )
+        Row("D off" if angle == GATE_OFF_DEG else f"D = {angle:g} deg", _with(config, fusion={"gate_angle_deg": angle}))
         for angle in GATE_ANGLES_DEG
     ]
-    rows += [Row(f"w = {w:g}", _causal(_with(config, fusion={"relative_weight": w}))) for w in RELATIVE_WEIGHTS]
+    rows += [Row(f"w = {w:g}", _with(config, fusion={"relative_weight": w})) for w in RELATIVE_WEIGHTS]
     return rows
 
 
 def selector_rows(config: HatConfig) -> list[Row]:
     """The decoder against what could stand in its place (paper, Sec. "Continuous-State Filters")."""
-    appearance = _with(config, selector={"motion_weight_per_deg": 0.0, "running_gate": False})
     return [
-        Row("best appearance", _causal(appearance)),
-        Row("forward Viterbi", _causal(config)),
-        Row("particle filter on SO(3)", lambda log: replay_temporal(log, config, ParticleSelector(config.selector))),
-        Row("UKF", lambda log: replay_temporal(log, config, UkfSelector(config.selector))),
-        Row("offline backtrace", lambda log: replay_offline(log, config)),
+        Row("best appearance", _with(config, selector=_BEST_APPEARANCE)),
+        Row("forward Viterbi", config),
+        Row("particle filter on SO(3)", config, selector="particles"),
+        Row("UKF", config, selector="ukf"),
+        Row("offline backtrace", config, offline=True),
     ]
 
 
 def reference_rows(config: HatConfig) -> list[Row]:
-    """Causal against offline on the same observations (paper, Table "Causal and offline HAT")."""
-    every_frame = _with(
-        config,
-        keyframes={"gap_frames": 1},
-        selector={"motion_weight_per_deg": 0.0, "running_gate": False},
-        fusion={"relative_weight": 0.0},
-    )
+    """Causal against offline on the same observations (paper, Table "Causal and offline HAT").
+
+    Independent poses take candidates at every frame, the others at keyframes; the last two rows take them at every
+    frame as well, so that nothing but the method differs.
+    """
+    every_frame = _with(config, keyframes={"gap_frames": 1})
     return [
-        Row("independent (best appearance, every frame)", _causal(every_frame)),
-        Row("causal", _causal(config)),
-        Row("offline", lambda log: replay_offline(log, config)),
+        Row("independent", _with(every_frame, selector=_BEST_APPEARANCE, fusion={"relative_weight": 0.0})),
+        Row("causal", config),
+        Row("offline", config, offline=True),
+        Row("causal, anchors at every frame", every_frame),
+        Row("offline, anchors at every frame", every_frame, offline=True),
     ]
 
 
 def table_of(title: str, rows: Sequence[Row], observations: Sequence[RunLog]) -> Table:
     """Run every row over every clip and pool the errors."""
-    return Table(
-        title,
-        (Column("name", "configuration"), *_ERRORS, *_ANCHORS),
-        [{"name": row.name, **pooled([row.variant(log) for log in observations])} for row in rows],
-    )
+    lines = [{"name": row.name, **pooled([row.replay(log) for log in observations])} for row in rows]
+    return Table(title, _COLUMNS, lines)
+
+
+def with_change(table: Table) -> Table:
+    """The same table with the relative change of E_p from the row above."""
+    rows: list[dict[str, Any]] = []
+    for row in table.rows:
+        rows.append({**row, "change": row["E_p_mean"] / rows[-1]["E_p_mean"] - 1.0 if rows else None})
+    return replace(table, columns=(*table.columns, Column("change", "E_p change", "+.1%")), rows=rows)
+
+
+def clip_table(rows: Sequence[Row], observations: Mapping[str, RunLog]) -> Table:
+    """E_p of every row side by side, clip by clip."""
+    lines = [
+        {"clip": clip, **{row.name: pooled([row.replay(log)])["E_p_mean"] for row in rows}}
+        for clip, log in observations.items()
+    ]
+    columns = (Column("clip", "clip"), *(Column(row.name, row.name, ".4f") for row in rows))
+    return Table("E_p by clip, on the same observations", columns, lines)
 
 
 def pooled(logs: Sequence[RunLog]) -> dict[str, Any]:
@@ -270,10 +336,6 @@ def pooled(logs: Sequence[RunLog]) -> dict[str, Any]:
         "anchor_over_90_share": float(np.mean(anchors > metrics.WRONG_BASIN_DEG)) if len(anchors) else float("nan"),
         "anchors": len(anchors),
     }
-
-
-def _causal(config: HatConfig) -> Variant:
-    return lambda log: replay_temporal(log, config)
 
 
 def _with(config: HatConfig, **sections: dict[str, Any]) -> HatConfig:

@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 from hat_ros import lie
-from hat_ros.config import HatConfig, KeyframeConfig
+from hat_ros.config import HatConfig, KeyframeConfig, config_from_dict, config_to_dict
 from hat_ros.core.selector import SelectorStage
 from hat_ros.errors import ConfigError, UsageError
 from hat_ros.evaluation import ablate
+from hat_ros.evaluation.ablate_figure import table_figure
+from hat_ros.evaluation.figures import image_bytes
 from hat_ros.evaluation.filters import FilterNoise, ParticleSelector, UkfSelector
 from hat_ros.evaluation.runlog import RunLogBuilder
+from hat_ros.evaluation.tables import Table
 from hat_ros.evaluation.temporal_replay import (
     keyframes_of,
     observations_of,
@@ -112,7 +115,7 @@ def test_every_frame_after_the_first_anchor_has_a_pose():
 
 def test_selection_earns_its_place_where_appearance_flips():
     log = observations(flip_every=5)
-    rows = {row.name: pooled(row.variant(log)) for row in ablate.component_rows(CONFIG)}
+    rows = {row.name: pooled(row.replay(log)) for row in ablate.component_rows(CONFIG)}
     fusion_only, viterbi = (rows[name] for name in ("keyframe anchors + SLAM fusion", "+ Viterbi basin selection"))
     assert fusion_only["anchor_over_90_share"] == 0.2
     assert viterbi["anchor_over_90_share"] == 0.05, "only the one during the warm-up"
@@ -174,8 +177,49 @@ def test_sweeps_cover_the_papers_settings():
 
 def test_table_pools_the_frames_of_all_clips():
     one, two = observations(n=20), observations(n=60, flip_every=2)
-    table = ablate.table_of("t", [ablate.Row("x", lambda log: replay_temporal(log, CONFIG))], [one, two])
+    table = ablate.table_of("t", [ablate.Row("x", CONFIG)], [one, two])
     assert table.rows[0]["targets"] == 80
+
+
+def test_clip_table_and_pooled_table_come_from_the_same_rows():
+    logs = {"one": observations(flip_every=3), "two": observations(flip_every=4, noise_deg=2.0, seed=1)}
+    rows = ablate.reference_rows(CONFIG)
+    by_clip, together = ablate.clip_table(rows, logs), ablate.table_of("t", rows, list(logs.values()))
+    for row in together.rows:
+        assert np.mean([line[row["name"]] for line in by_clip.rows]) == pytest.approx(row["E_p_mean"])
+    for line in by_clip.rows:
+        assert line["offline"] < line["causal"] < line["independent"]
+
+
+def test_change_is_relative_to_the_row_above():
+    table = ablate.with_change(Table("t", (), [{"E_p_mean": 0.4}, {"E_p_mean": 0.3}, {"E_p_mean": 0.33}]))
+    assert [row["change"] for row in table.rows] == [None, pytest.approx(-0.25), pytest.approx(0.1)]
+
+
+def test_the_inertial_row_differs_from_the_one_above_by_the_prior_alone():
+    above, row = ablate.component_rows(CONFIG)[-2:]
+    assert above.config.fusion.inertial_weight == 0.0
+    assert row.settings(above.config)["settings"] == {"fusion.inertial_weight": CONFIG.fusion.relative_weight}
+
+
+def test_the_settings_of_a_row_make_its_configuration():
+    for row in (row for rows in ablate.table_rows(CONFIG).values() for row in rows):
+        data = config_to_dict(CONFIG)
+        for key, value in row.settings(CONFIG)["settings"].items():
+            section, name = key.split(".")
+            data[section][name] = value
+        assert config_from_dict(data) == row.config
+
+
+@pytest.mark.parametrize("table", ["rows", "clips"])
+def test_figures_have_a_bar_per_figure_and_the_same_bytes_every_time(table):
+    log = observations(n=20)
+    drawn = ablate.table_of("t", [ablate.Row("x", CONFIG), ablate.Row("y", CONFIG)], [log])
+    if table == "clips":
+        drawn = ablate.clip_table(ablate.reference_rows(CONFIG)[:3], {"one": log, "two": log})
+    figure = table_figure(drawn)
+    assert len(figure.axes[0].patches) == (2 if table == "rows" else 6)
+    assert image_bytes(figure) == image_bytes(table_figure(drawn))
 
 
 def test_plan_merges_presets_and_refuses_bad_ones(tmp_path):
