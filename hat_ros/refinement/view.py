@@ -18,6 +18,7 @@ from hat_ros.refinement.contour import (
     COL_WEIGHT,
     contour_table,
 )
+from hat_ros.refinement.outline import grid_rays, pixel_rays, place_pixels, spread_grid
 from hat_ros.render.embree import RayCaster
 from hat_ros.target import Target
 from hat_ros.types import Camera
@@ -56,7 +57,7 @@ class View:
 
 
 class TargetViewer:
-    """Casts silhouettes of one target for refinement and scoring: every second pixel, then all near the outline."""
+    """Casts silhouettes of one target for refinement and scoring, most rays near the outline."""
 
     def __init__(self, target: Target) -> None:
         self.target = target
@@ -91,36 +92,14 @@ class TargetViewer:
     def _cast(self, T_cam_target: NDArray[np.float64], crop: Camera) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
         """Silhouette and depth near its outline, both (h, w)."""
         R, t = T_cam_target[:3, :3], T_cam_target[:3, 3]
-        to_ray = (R.T @ np.linalg.inv(crop.K)).T  # rays in the target frame are affine in the pixel
+        to_ray = np.ascontiguousarray((R.T @ np.linalg.inv(crop.K)).T)  # rays in the target frame: affine in the pixel
         origin = -t @ R
-        ys, xs = np.mgrid[0 : crop.height : 2, 0 : crop.width : 2]
-        hit, z = self._trace(xs.ravel(), ys.ravel(), to_ray, origin)
-        coarse = hit.reshape(xs.shape).view(np.uint8)
-        kernel = np.ones((3, 3), np.uint8)
-        near = cv2.dilate(coarse, kernel) != cv2.erode(coarse, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0)
-        mask = np.repeat(np.repeat(coarse.view(np.bool_), 2, axis=0), 2, axis=1)
-        depth = np.zeros(mask.shape, np.float32)
-        depth[::2, ::2] = z.reshape(xs.shape)
-        todo = np.repeat(np.repeat(near, 2, axis=0), 2, axis=1)
-        todo[::2, ::2] = False
-        y, x = np.nonzero(todo)
+        hits = self._caster.trace(*grid_rays(crop.width, crop.height, to_ray, origin))
+        mask, depth, x, y = spread_grid(hits["primID"], hits["tfar"], crop.width, crop.height)
         if len(x):
-            hit, z = self._trace(x, y, to_ray, origin)
-            mask[y, x] = hit
-            depth[y, x] = z
+            hits = self._caster.trace(*pixel_rays(x, y, to_ray, origin))
+            place_pixels(mask, depth, x, y, hits["primID"], hits["tfar"])
         return mask, depth
-
-    def _trace(
-        self, x: NDArray[np.intp], y: NDArray[np.intp], to_ray: NDArray[np.float64], origin: NDArray[np.float64]
-    ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-        """Hit (N,) and depth (N,) of the rays through crop pixels."""
-        directions = np.empty((len(x), 3), np.float32)
-        for axis in range(3):
-            directions[:, axis] = x * to_ray[0, axis] + y * to_ray[1, axis] + to_ray[2, axis]
-        origins = np.empty_like(directions)
-        origins[:] = origin
-        hits = self._caster.trace(origins, directions)
-        return hits["primID"] >= 0, hits["tfar"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,10 @@
+import cv2
 import numpy as np
 import pytest
 from shape_scene import CAMERA, random_pose, spacecraft
 
 from hat_ros import lie
+from hat_ros.refinement.outline import spread_grid
 from hat_ros.refinement.refiner import PoseFitter
 from hat_ros.refinement.view import MaskField, TargetViewer
 from hat_ros.render import create_renderer
@@ -75,3 +77,23 @@ def test_a_large_image_costs_no_larger_crop(viewer):
     camera = Camera(np.array([[4000.0, 0, 2000], [0, 4000.0, 1500], [0, 0, 1]]), 4000, 3000)
     view = viewer.view(random_pose(np.random.default_rng(0), viewer.target), camera, 96)
     assert max(view.mask.shape) <= 102
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_outline_pixels_are_those_of_blocks_next_to_the_other_side(seed):
+    rng = np.random.default_rng(seed)
+    rows, cols = 9, 13
+    hit = cv2.GaussianBlur(rng.random((rows, cols)), (0, 0), 1.5) > 0.5
+    face = np.where(hit, rng.integers(0, 100, hit.shape), -1).astype(np.int32).ravel()
+    mask, depth, x, y = spread_grid(face, np.arange(face.size, dtype=np.float32), 2 * cols, 2 * rows)
+    np.testing.assert_array_equal(mask, np.kron(hit, np.ones((2, 2), bool)))
+    np.testing.assert_array_equal(depth[::2, ::2].ravel(), np.arange(face.size))
+    around = np.pad(hit, 1)  # beyond the crop nothing is hit
+    windows = np.lib.stride_tricks.sliding_window_view(around, (3, 3))
+    inner = np.lib.stride_tricks.sliding_window_view(np.pad(hit, 1, mode="edge"), (3, 3))
+    mixed = inner.any(axis=(2, 3)) & ~windows.all(axis=(2, 3))
+    expected = np.kron(mixed, np.array([[0, 1], [1, 1]], bool))
+    asked = np.zeros_like(expected)
+    asked[y, x] = True
+    np.testing.assert_array_equal(asked, expected)
+    assert len(x) == expected.sum(), "no pixel twice"
