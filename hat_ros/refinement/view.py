@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -134,34 +135,38 @@ class MaskField:
 
     def __init__(self, mask: NDArray[np.bool_]) -> None:
         self.mask = mask
-        self.area_px = float(np.count_nonzero(mask))
-        rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-        self.size_px = float(max(np.ptp(rows), np.ptp(cols)) + 1)
-        part = mask[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
-        x_counts, y_counts = np.count_nonzero(part, axis=0), np.count_nonzero(part, axis=1)
-        self.centroid_px = (
-            np.array([x_counts @ np.arange(cols[0], cols[-1] + 1), y_counts @ np.arange(rows[0], rows[-1] + 1)])
-            / self.area_px
-        )
+        pixels = mask.view(np.uint8)
+        left, top, width, height = cv2.boundingRect(pixels)
+        moments = cv2.moments(pixels[top : top + height, left : left + width], binaryImage=True)
+        self.area_px = moments["m00"]
+        self.size_px = float(max(width, height))
+        self.centroid_px = np.array([left + moments["m10"] / self.area_px, top + moments["m01"] / self.area_px])
         margin = int(max(_MIN_MARGIN_PX, _MARGIN_SHARE * self.size_px))
         # Beyond the image border nothing is known: the border pixels continue, so that a cut is no contour.
-        height, width = mask.shape
-        y0, y1 = max(rows[0] - margin, -margin), min(rows[-1] + 1 + margin, height + margin)
-        x0, x1 = max(cols[0] - margin, -margin), min(cols[-1] + 1 + margin, width + margin)
+        y0, y1 = max(top - margin, -margin), min(top + height + margin, mask.shape[0] + margin)
+        x0, x1 = max(left - margin, -margin), min(left + width + margin, mask.shape[1] + margin)
         self.origin_px = np.array([x0, y0], dtype=np.float64)
-        iy = np.clip(np.arange(y0, y1), 0, height - 1)
-        ix = np.clip(np.arange(x0, x1), 0, width - 1)
-        crop = mask[np.ix_(iy, ix)].astype(np.uint8)
-        # A boundary lies half a pixel from the centres on either side of it.
-        outside = cv2.distanceTransform(1 - crop, cv2.DIST_L2, 5) - 0.5
-        inside = cv2.distanceTransform(crop, cv2.DIST_L2, 5) - 0.5 if not crop.all() else np.full_like(outside, 1e3)
-        distance = np.where(crop > 0, -inside, outside).astype(np.float32)
+        inside = pixels[max(y0, 0) : y1, max(x0, 0) : x1]
+        beyond = (max(-y0, 0), max(y1 - mask.shape[0], 0), max(-x0, 0), max(x1 - mask.shape[1], 0))
+        crop = cv2.copyMakeBorder(inside, *beyond, cv2.BORDER_REPLICATE)
+        self._beyond = beyond
+        outward = cv2.distanceTransform(1 - crop, cv2.DIST_L2, 5)
+        inward = cv2.distanceTransform(crop, cv2.DIST_L2, 5) if not crop.all() else np.full_like(outward, 1e3 + 0.5)
+        # One of the two is zero. A boundary lies half a pixel from the centres on either side of it.
+        distance = outward - inward
+        distance += crop
+        distance -= np.float32(0.5)
         self.distance = cv2.GaussianBlur(distance, (0, 0), 1.0)
-        within = ((iy == np.arange(y0, y1))[:, None]) & ((ix == np.arange(x0, x1))[None])
-        depth = -self.distance[within & (self.distance < 0)]
-        self._depth_counts = np.bincount(
-            np.minimum(depth * (1 / _DEPTH_BIN_PX), _DEPTH_BINS - 1).astype(np.intp), minlength=_DEPTH_BINS
-        )
+
+    @cached_property
+    def _depth_counts(self) -> NDArray[np.intp]:
+        """Histogram of how deep inside the mask its pixels lie, those of the image only."""
+        top, bottom, left, right = self._beyond
+        height, width = self.distance.shape
+        seen = self.distance[top : height - bottom, left : width - right]
+        depth = -seen[seen < 0]
+        bins = np.minimum(depth * (1 / _DEPTH_BIN_PX), _DEPTH_BINS - 1).astype(np.intp)
+        return np.bincount(bins, minlength=_DEPTH_BINS)
 
     def compare(self, view: View, luma: NDArray[np.uint8], tolerance_px: float | None = None) -> Overlap:
         """Areas of agreement and disagreement with a rendered silhouette.
