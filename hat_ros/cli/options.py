@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hat_ros.config import HatConfig
+    from hat_ros.source import SourceSpec
 
 FORMATS = ("sequence", "spark", "shirt", "swisscube", "bop")
 
@@ -62,6 +63,16 @@ def add_dataset(parser: argparse.ArgumentParser) -> None:
         metavar="PATH",
         help="masks or boxes computed elsewhere, for --set segmentation.backend=annotated; see `hat import --help`",
     )
+
+
+def spec_of(arguments: argparse.Namespace) -> SourceSpec:
+    """The recording that a command's ``recording``, :func:`add_dataset` and ``--sequence`` name."""
+    from hat_ros.errors import UsageError
+    from hat_ros.source import SourceSpec
+
+    if bool(arguments.dataset) != bool(arguments.sequence):
+        raise UsageError("--dataset and --sequence belong together: name the layout and one of its sequences")
+    return SourceSpec(arguments.recording, arguments.dataset, arguments.sequence, arguments.model, arguments.detections)
 
 
 def add_threads(parser: argparse.ArgumentParser) -> None:

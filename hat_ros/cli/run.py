@@ -15,6 +15,7 @@ from hat_ros.cli.options import (
     limit_threads,
     natural,
     positive,
+    spec_of,
 )
 
 MODES = ("hat", "independent", "tracking", "offline", "srt3d", "observe")
@@ -126,13 +127,9 @@ def _add_track(commands: Commands) -> None:
 def _track(arguments: argparse.Namespace) -> int:
     limit_threads(arguments.threads)
     from hat_ros.cli.console import print_figures, state_progress
-    from hat_ros.errors import UsageError
     from hat_ros.runner import TrackOptions, track
-    from hat_ros.source import SourceSpec
 
-    if bool(arguments.dataset) != bool(arguments.sequence):
-        raise UsageError("track: --dataset and --sequence belong together: name the layout and one of its sequences")
-    spec = SourceSpec(arguments.recording, arguments.dataset, arguments.sequence, arguments.model, arguments.detections)
+    spec = spec_of(arguments)
     options = TrackOptions(
         mode=arguments.mode,
         credits=arguments.credits,

@@ -1,17 +1,27 @@
-"""``hat weights`` and ``hat doctor``: what is on this machine."""
+"""``hat weights``, ``hat doctor`` and ``hat profile``: what is on this machine, and what it can do."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from hat_ros.cli.options import Commands
+from hat_ros.cli.options import (
+    Commands,
+    add_config,
+    add_dataset,
+    add_threads,
+    config_of,
+    limit_threads,
+    positive,
+    spec_of,
+)
 
 
 def add_commands(commands: Commands) -> None:
     """Register this group."""
     _add_weights(commands)
     _add_doctor(commands)
+    _add_profile(commands)
 
 
 def _add_weights(commands: Commands) -> None:
@@ -86,3 +96,39 @@ def _doctor(_: argparse.Namespace) -> int:
         table.add_row(finding.what, Text(finding.verdict, style[finding.verdict]), Text(finding.found))
     Console().print(table)
     return 1 if any(finding.verdict == "missing" for finding in findings) else 0
+
+
+def _add_profile(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "profile",
+        help="network passes, renders, time and memory per keyframe",
+        description="Run HAT over a recording, count every network pass and render, and time every part: per keyframe, "
+        "per frame between keyframes, and once at the start (weights, templates, first keyframe). Stages run one after "
+        "another; `hat bench --modes hat,graph` measures them overlapped.",
+    )
+    parser.add_argument("recording", type=Path, help="bag, folder of the `sequence` layout, or root of a data set")
+    add_dataset(parser)
+    parser.add_argument("--sequence", default="", metavar="NAME", help="which sequence of the data set")
+    add_config(parser, "mega_hat")
+    parser.add_argument("--limit", type=positive, metavar="N", help="at most N frames (default: all)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there as well")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    add_threads(parser)
+    parser.set_defaults(command=_profile)
+
+
+def _profile(arguments: argparse.Namespace) -> int:
+    limit_threads(arguments.threads)
+    from hat_ros.cli.console import state_progress
+    from hat_ros.evaluation.profile import profile
+    from hat_ros.evaluation.score import write_json
+
+    source = spec_of(arguments).open()
+    with state_progress("profiling", arguments.quiet) as watch:
+        measured = profile(source, config_of(arguments), arguments.limit, watch)
+    print(measured.table().text())
+    for name, value in measured.summary().items():
+        print(f"{name}: {value:.1f}" if isinstance(value, float) else f"{name}: {value}")
+    if arguments.json is not None:
+        write_json(arguments.json, measured.summary() | {"parts": list(measured.table().rows)})
+    return 0
