@@ -1,4 +1,4 @@
-"""``hat evaluate``, ``hat plot``, ``hat bench``, ``hat ablate``: what the runs are worth."""
+"""``hat evaluate``, ``hat plot``, ``hat score``, ``hat bench``, ``hat ablate``: what the runs are worth."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hat_ros.cli.options import Commands, add_config, add_dataset, natural, positive
+from hat_ros.cli.options import Commands, add_config, add_dataset, add_extent, add_out, natural, positive, spec_of
 from hat_ros.cli.run import MODES
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ def add_commands(commands: Commands) -> None:
     """Register this group."""
     _add_evaluate(commands)
     _add_plot(commands)
+    _add_score(commands)
     _add_bench(commands)
     _add_ablate(commands)
 
@@ -62,6 +63,45 @@ def _plot(arguments: argparse.Namespace) -> int:
 
     for path in plot_folder(arguments.folder, arguments.out or arguments.folder / "plots", arguments.format):
         print(path)
+    return 0
+
+
+def _add_score(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "score",
+        help="poses of a method that is not ours, as a run like any other",
+        description="Score a file of poses that another tracker (RGBTrack, FoundationPose, your own) made of a "
+        "recording, and write a result folder. FILE is TUM (stamp in seconds, x y z qx qy qz qw) or, ending in .csv, "
+        "BOP (scene_id,im_id,obj_id,score,R,t,time). Poses map the CAD file's own axes to the OpenCV camera, in "
+        "metres (BOP: millimetres). `hat bench --poses NAME=FILE` puts it into the table beside the others.",
+    )
+    parser.add_argument("recording", type=Path, help="bag, folder of the `sequence` layout, or root of a data set")
+    parser.add_argument("--poses", required=True, type=Path, metavar="FILE", help="TUM or BOP file")
+    parser.add_argument("--method", default="external", metavar="NAME", help="its name in tables (default: external)")
+    parser.add_argument("--fps", type=float, metavar="X", help="its frame rate, if you measured it")
+    add_dataset(parser)
+    parser.add_argument("--sequence", default="", metavar="NAME", help="which sequence of the data set")
+    add_out(parser, "result folder to write")
+    add_extent(parser)
+    parser.set_defaults(command=_score)
+
+
+def _score(arguments: argparse.Namespace) -> int:
+    from hat_ros.cli.console import print_figures
+    from hat_ros.external import ScoreOptions, score_poses
+
+    options = ScoreOptions(
+        method=arguments.method,
+        fps=arguments.fps,
+        start=arguments.start,
+        limit=arguments.limit,
+        video=not arguments.no_video,
+        report=not arguments.no_report,
+        overwrite=arguments.overwrite,
+    )
+    folder = score_poses(spec_of(arguments), arguments.poses, arguments.out, options)
+    if not arguments.quiet:
+        print_figures(folder)
     return 0
 
 
@@ -114,6 +154,13 @@ def _names(*known: str) -> argparse.Action:
         return list(dict.fromkeys(names))
 
     return parse
+
+
+def _method_file(text: str) -> tuple[str, str]:
+    name, separator, pattern = text.partition("=")
+    if not name or not separator or not pattern or "/" in name:
+        raise argparse.ArgumentTypeError(f"expected NAME=FILE, found '{text}'")
+    return name, pattern
 
 
 def _numbers(text: str) -> list[int]:
@@ -169,6 +216,15 @@ def _add_bench(commands: Commands) -> None:
         metavar="LIST",
         help="cold starts at these frames, e.g. 0,60,120 (default: 0)",
     )
+    parser.add_argument(
+        "--poses",
+        type=_method_file,
+        action="append",
+        default=[],
+        metavar="NAME=FILE",
+        help="a row for a method that is not ours, from its file of poses (see `hat score`); {clip} in FILE stands for "
+        "the clip's name (repeatable)",
+    )
     parser.add_argument("--stages", action="store_true", help="print the time per stage as well")
     parser.set_defaults(command=_bench)
 
@@ -188,6 +244,7 @@ def _bench(arguments: argparse.Namespace) -> int:
         arguments.config,
         arguments.overrides,
         arguments.limit,
+        dict(arguments.poses),
     )
     out = arguments.out.resolve()
     with campaign_progress(len(jobs)) as watch:

@@ -75,6 +75,15 @@ def spec_of(arguments: argparse.Namespace) -> SourceSpec:
     return SourceSpec(arguments.recording, arguments.dataset, arguments.sequence, arguments.model, arguments.detections)
 
 
+def add_extent(parser: argparse.ArgumentParser) -> None:
+    """``--start``, ``--limit``, and what not to write."""
+    parser.add_argument("--start", type=natural, default=0, metavar="N", help="skip the first N frames (cold start)")
+    parser.add_argument("--limit", type=positive, metavar="N", help="process at most N frames")
+    parser.add_argument("--no-video", action="store_true", help="do not write the overlay video")
+    parser.add_argument("--no-report", action="store_true", help="do not write report.html")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar, no table")
+
+
 def add_threads(parser: argparse.ArgumentParser) -> None:
     """``--threads``."""
     parser.add_argument(

@@ -9,6 +9,7 @@ from hat_ros.cli.options import (
     Commands,
     add_config,
     add_dataset,
+    add_extent,
     add_out,
     add_threads,
     config_of,
@@ -53,7 +54,7 @@ def _add_replay(commands: Commands) -> None:
         metavar="ID",
         help="ROS domain to play in, so that nodes of your own can listen (default: one that nobody else uses)",
     )
-    _add_common(parser)
+    add_extent(parser)
     parser.set_defaults(command=_replay)
 
 
@@ -64,14 +65,6 @@ def _add_credits(parser: argparse.ArgumentParser) -> None:
         metavar="W",
         help="frames in flight; the poses do not depend on it (default: graph.credits_replay)",
     )
-
-
-def _add_common(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--start", type=natural, default=0, metavar="N", help="skip the first N frames (cold start)")
-    parser.add_argument("--limit", type=positive, metavar="N", help="process at most N frames")
-    parser.add_argument("--no-video", action="store_true", help="do not write the overlay video")
-    parser.add_argument("--no-report", action="store_true", help="do not write report.html")
-    parser.add_argument("--quiet", action="store_true", help="no progress bar, no table")
 
 
 def _replay(arguments: argparse.Namespace) -> int:
@@ -119,7 +112,7 @@ def _add_track(commands: Commands) -> None:
         "(default: hat)",
     )
     _add_credits(parser)
-    _add_common(parser)
+    add_extent(parser)
     add_threads(parser)
     parser.set_defaults(command=_track)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +100,7 @@ def bench_jobs(
     config: str,
     overrides: Sequence[str] = (),
     limit: int | None = None,
+    externals: Mapping[str, str] | None = None,
 ) -> list[Job]:
     """The runs of a benchmark, clip by clip.
 
@@ -111,9 +112,10 @@ def bench_jobs(
         config: preset or YAML file.
         overrides: settings for all runs.
         limit: at most this many frames per run.
+        externals: name of a method that is not ours -> its file of poses, ``{clip}`` standing for the clip's name.
 
     Raises:
-        UsageError: two clips have the same name.
+        UsageError: two clips have the same name; a file of poses is missing, or its method has the name of ours.
     """
     jobs: dict[str, Job] = {}
     for spec, own_settings in clips:
@@ -126,6 +128,15 @@ def bench_jobs(
                     settings = (*overrides, *own_settings, *(GIVEN_MASKS if mask == "given" else ()))
                     labels = {"group": spec.group, "clip": spec.name, "masks": mask, "start": str(start), "mode": mode}
                     jobs[name] = Job(name, spec, mode, config, settings, start, limit, labels)
+        for start in starts:
+            for method, pattern in (externals or {}).items():
+                name, poses = f"{spec.name}-{method}-{start}", Path(pattern.replace("{clip}", spec.name)).resolve()
+                if method in modes:
+                    raise UsageError(f"--poses {method}: a method of that name runs already, choose another name")
+                if not poses.is_file():
+                    raise UsageError(f"--poses {method}: {poses} does not exist; use {{clip}} for the clip's name")
+                labels = {"group": spec.group, "clip": spec.name, "masks": "-", "start": str(start), "mode": method}
+                jobs[name] = Job(name, spec, method, config, (), start, limit, labels, poses)
     return list(jobs.values())
 
 

@@ -63,7 +63,10 @@ def _panel(axis: Axes, rows: Sequence[dict[str, Any]]) -> None:
 def _label(row: dict[str, Any], rows: Sequence[dict[str, Any]]) -> str:
     """The mode, and whatever else tells the bars of one panel apart."""
     parts = [row["mode"]]
-    parts += [f"{key} {row[key]}" for key in ("masks", "start") if len({other.get(key) for other in rows}) > 1]
+    for key in ("masks", "start"):
+        told = {other.get(key) for other in rows} - {"-"}
+        if len(told) > 1 and row.get(key) in told:
+            parts.append(f"{key} {row[key]}")
     return ", ".join(parts)
 
 

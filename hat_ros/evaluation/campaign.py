@@ -20,7 +20,7 @@ from typing import Any
 
 from hat_ros.config import load_config
 from hat_ros.errors import RunError
-from hat_ros.provenance import code_hash, config_hash
+from hat_ros.provenance import code_hash, config_hash, input_hash
 from hat_ros.results import METRICS_FILE, RUN_FILE
 from hat_ros.source import SourceSpec
 
@@ -45,6 +45,7 @@ class Job:
         start: frames skipped.
         limit: at most this many frames.
         labels: what the tables call it, column by column.
+        poses: file of poses of a method that is not ours, which is then only scored; ``mode`` is its name.
     """
 
     name: str
@@ -55,12 +56,17 @@ class Job:
     start: int = 0
     limit: int | None = None
     labels: dict[str, str] = field(default_factory=dict)
+    poses: Path | None = None
 
     def fingerprint(self) -> dict[str, Any]:
         """What ``run.json`` of this run must hold."""
+        if self.poses is None:
+            determined_by = {"config_sha256": config_hash(load_config(self.config, self.overrides))}
+        else:
+            determined_by = {"poses_sha256": input_hash(self.poses)}
         return {
             "source_sha256": _sha256(self.spec),
-            "config_sha256": config_hash(load_config(self.config, self.overrides)),
+            **determined_by,
             "code_sha256": code_hash(),
             "mode": "hat" if self.mode == GRAPH else self.mode,
             "start": self.start,
@@ -69,11 +75,14 @@ class Job:
 
     def command(self, folder: Path) -> list[str]:
         """The command line that makes ``folder``."""
-        command = [sys.executable, "-m", "hat_ros.cli", "replay" if self.mode == GRAPH else "track"]
-        command += [str(self.spec.path), "--out", str(folder), "--config", self.config, "--start", str(self.start)]
-        command += ["--no-video", "--no-report", "--quiet", "--overwrite"]
-        if self.mode != GRAPH:
-            command += ["--mode", self.mode, "--threads", "1"]
+        if self.poses is not None:
+            how = ["score", "--method", self.mode, "--poses", str(self.poses)]
+        elif self.mode == GRAPH:
+            how = ["replay", "--config", self.config]
+        else:
+            how = ["track", "--mode", self.mode, "--config", self.config, "--threads", "1"]
+        command = [sys.executable, "-m", "hat_ros.cli", *how, str(self.spec.path), "--out", str(folder)]
+        command += ["--start", str(self.start), "--no-video", "--no-report", "--quiet", "--overwrite"]
         if self.spec.dataset:
             command += ["--dataset", self.spec.dataset, "--sequence", self.spec.sequence]
         if self.spec.model is not None:
