@@ -118,7 +118,7 @@ class FeatureSlamConfig:
 
     max_points: int = option(200, "point tracks kept alive", low=16, high=2000)
     spacing_px: float = option(4.0, "least distance between a new point and any other, px", low=1)
-    window_frames: int = option(14, "frames adjusted together, spread over the span", low=8, high=64)
+    window_frames: int = option(10, "frames adjusted together, spread over the span", low=8, high=64)
     window_span_frames: int = option(60, "age at which a frame leaves the window", low=8, high=1000)
     iterations: int = option(3, "bundle adjustment steps per frame", low=1, high=50)
     sigma_px: float = option(1.0, "standard deviation of a track: errors persist, so more than its jitter", low=0.01)

@@ -153,7 +153,8 @@ class FeatureSlam:
             self._met_prior = True
             window.try_prior()
             return
-        turn, phase = divmod(window.number[-1], _RIVAL_PERIOD)
+        # A trusted CAD surface leaves little room for another solution: half as often.
+        turn, phase = divmod(window.number[-1], _RIVAL_PERIOD * (2 if window.trusts_prior else 1))
         if phase == 0 and len(window) > 3:
             if window.trusts_prior and turn % 2 == 0:
                 window.challenge_prior()
