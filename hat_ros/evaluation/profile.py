@@ -40,10 +40,10 @@ class Part:
     counted: int | None = None
 
 
-_RENDERS = Part("  renders", "hat_ros.render.network_views:NetworkViewRenderer.render")
+_TEMPLATES = Part("  templates rendered", "hat_ros.render.network_views:NetworkViewRenderer.render")
 _TRANSFORMER = Part("  transformer", "hat_ros.nets.dinov2:DinoV2.forward", 0)
 _MEGAPOSE = (
-    _RENDERS,
+    Part("  renders", "hat_ros.render.network_views:NetworkViewRenderer.render_many", 0),
     Part("  crops", "hat_ros.nets.megapose:roi_align", 1),
     Part("  coarse network", "hat_ros.nets.megapose:CoarseNet.forward", 0),
     Part("  refiner network", "hat_ros.nets.megapose:RefinerNet.forward", 0),
@@ -56,7 +56,7 @@ PARTS = {
     ),
     "megapose": _MEGAPOSE,
     "picopose": (
-        _RENDERS,
+        _TEMPLATES,
         _TRANSFORMER,
         Part("  retrieval", "hat_ros.nets.picopose:match_templates"),
         Part("  affine network", "hat_ros.nets.picopose:AffineRegressor.forward", 0),
@@ -65,6 +65,7 @@ PARTS = {
         Part("  PnP", "hat_ros.hypotheses.picopose:solve_pose"),
     ),
     "gigapose": (
+        _TEMPLATES,
         _TRANSFORMER,
         Part("  second network", "hat_ros.nets.gigapose:_IstBackbone.forward", 0),
         Part("  matching", "hat_ros.nets.gigapose:match"),

@@ -24,7 +24,7 @@ from hat_ros.types import Candidates, Detection, Frame, PosePrior
 
 LOG = logging.getLogger(__name__)
 
-_FORMAT = 1
+_FORMAT = 2
 
 
 class GigaPoseHypotheses:

@@ -32,7 +32,7 @@ from hat_ros.types import Camera, Candidates, Detection, Frame, PosePrior
 
 LOG = logging.getLogger(__name__)
 
-_FORMAT = 1
+_FORMAT = 2
 _N_CROP_POINTS, _N_VIEW_POINTS = 2000, 200
 _CANONICAL_HALF_SIZE = 0.2
 _CROP_SIZE = (mp.CROP_WIDTH, mp.CROP_HEIGHT)
@@ -74,7 +74,7 @@ class MegaPose:
         """Coarse logits of ready uint8 renders, in batches: (3, H, W), (B, 4), (B, 6, 240, 320) -> (B,)."""
         logits = []
         for batch in self.runtime.batches(len(boxes), self.settings.batch_size):
-            views = renders[batch].to(self.runtime.device).float() / 255
+            views = renders[batch].float() / 255
             logits.append(mp.score_renders(self._coarse, image, boxes[batch], views))
         return torch.cat(logits)
 
@@ -121,7 +121,7 @@ class MegaPoseHypotheses:
         if self._views is None or not _same_camera(self._views[0], camera):
             key = f"{_FORMAT}:{self._target.sha256}:{camera.K.tobytes().hex()}:{camera.width}x{camera.height}"
             arrays = cached_arrays("megapose-views", key, lambda: {"views": self._render_coarse(camera)})
-            self._views = camera, torch.from_numpy(np.array(arrays["views"]))
+            self._views = camera, torch.from_numpy(np.array(arrays["views"])).to(self._megapose.runtime.device)
         return self._views[1]
 
     def _render_coarse(self, camera: Camera) -> NDArray[np.uint8]:
@@ -138,10 +138,10 @@ class MegaPoseHypotheses:
 
 
 class TorchViews:
-    """:class:`hat_ros.nets.megapose.ViewRenderer` on top of the ray caster."""
+    """:class:`hat_ros.nets.megapose.ViewRenderer` on the CPU, on as many threads as torch has."""
 
     def __init__(self, target: Target, runtime: Runtime) -> None:
-        self._renderer = NetworkViewRenderer(target)
+        self._renderer = NetworkViewRenderer(target, torch.get_num_threads())
         self._runtime = runtime
 
     def render_views(self, T_cam_target: Tensor, K: Tensor) -> Tensor:
@@ -152,8 +152,8 @@ class TorchViews:
     def render_bytes(self, T_cam_target: Tensor, K: Tensor) -> NDArray[np.uint8]:
         """(B, 4, 4), (B, 3, 3) -> (B, 6, 240, 320) uint8."""
         poses, cameras = T_cam_target.double().cpu().numpy(), K.double().cpu().numpy()
-        views = [self._renderer.render(T, k, _CROP_SIZE) for T, k in zip(poses, cameras, strict=True)]
-        return np.ascontiguousarray(np.stack(views).transpose(0, 3, 1, 2))
+        views = self._renderer.render_many(poses, cameras, _CROP_SIZE)
+        return np.ascontiguousarray(views.transpose(0, 3, 1, 2))
 
 
 def crop_points(target: Target, runtime: Runtime) -> mp.CropPoints:

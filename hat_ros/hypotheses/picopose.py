@@ -34,7 +34,7 @@ from hat_ros.types import Candidates, Detection, Frame, PosePrior
 
 LOG = logging.getLogger(__name__)
 
-_FORMAT = 1
+_FORMAT = 2
 _MIN_CORRESPONDENCES = 4
 
 
@@ -58,9 +58,8 @@ class PicoPoseHypotheses:
 
     def _load_templates(self, target: Target, weights: str) -> None:
         arrays = cached_arrays("picopose", f"{_FORMAT}:{target.sha256}:{weights}", lambda: self._build(target))
-        levels = [torch.from_numpy(np.array(arrays[f"features{i}"])) for i in range(len(pp.FEATURE_BLOCKS) - 1)]
         tensor = self._runtime.tensor
-        self._lower_levels = levels
+        self._lower_levels = [arrays[f"features{i}"] for i in range(len(pp.FEATURE_BLOCKS) - 1)]
         self._matching = tensor(arrays["features3"])
         self._masks, self._M, self._T = tensor(arrays["masks"]), tensor(arrays["M"]), tensor(arrays["T_cam_target"])
         self._points_m = np.array(arrays["points_m"])
@@ -115,8 +114,8 @@ class PicoPoseHypotheses:
 
     def _correspond(self, features: list[Tensor], best: Tensor, affine: Tensor) -> list[tuple[NDArray, NDArray]]:
         """Per hypothesis: template cells (M, 2) and image cells (M, 2), x y at 64 x 64."""
-        on_cpu = best.cpu()
-        templates = [level[on_cpu].to(self._runtime.device) for level in self._lower_levels] + [self._matching[best]]
+        chosen = best.cpu().numpy()
+        templates = [self._runtime.tensor(level[chosen]) for level in self._lower_levels] + [self._matching[best]]
         head = self._net.offset_regressor.dpt_head
         image = [x.expand(len(best), -1, -1, -1) for x in head(features)]
         masks = self._masks[best]
