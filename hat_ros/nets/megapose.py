@@ -25,7 +25,7 @@ _ROI_SAMPLES = 4
 
 
 class ViewRenderer(Protocol):
-    """Renders the target the way the networks were trained (``render.panda3d``)."""
+    """Renders the target the way the networks were trained (``render.network_views``)."""
 
     def render_views(self, T_cam_target: Tensor, K: Tensor) -> Tensor:
         """(B, 4, 4) poses and (B, 3, 3) crop intrinsics -> (B, 6, 240, 320) RGB and coded normals in [0, 1]."""
