@@ -21,6 +21,7 @@ import numpy as np
 from hat_ros import lie
 from hat_ros.config import HatConfig
 from hat_ros.core.offline import solve_offline
+from hat_ros.core.refined import is_supported, quality
 from hat_ros.core.refiner import Refiner
 from hat_ros.errors import UsageError
 from hat_ros.evaluation.srt3d import Srt3d
@@ -34,6 +35,8 @@ from hat_ros.types import Camera, Candidates, Detection, Estimate, Frame, Motion
 
 MODES = ("hat", "independent", "tracking", "offline", "srt3d", "observe")
 
+# The paper's dense refinement rejects what lies further than this from the anchors.
+_SAME_BASIN_DEG = 90.0
 _NO_POSE = np.full(7, np.nan)
 _NO_COVARIANCE = np.full((6, 6), np.nan)
 
@@ -257,13 +260,24 @@ class Offline:
         return estimates
 
     def _refined(self, index: int, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A pose refined on its image; from the causal pose where that stands elsewhere and the image prefers it."""
         if self._refiner is None or not np.isfinite(row).all():
             return row, _NO_COVARIANCE
         frame, detection = self._images[index].load()
-        refined = self._refiner.refine(frame, detection, lie.matrix_from_row(row))
-        if refined is None or refined.support < self._config.refinement.min_support:
+        config, T_cam_target = self._config.refinement, lie.matrix_from_row(row)
+        best = self._refiner.refine(frame, detection, T_cam_target)
+        causal = self._steps[index].estimate
+        if causal.state.has_pose:
+            known = T_cam_target if best is None else best.T_cam_target
+            apart_deg = np.degrees(lie.angle_between(causal.T_cam_target[:3, :3], known[:3, :3]))
+            # Like the paper's dense refinement, which never leaves the basin of the anchors.
+            if config.same_pose_deg < apart_deg < _SAME_BASIN_DEG:
+                other = self._refiner.refine(frame, detection, causal.T_cam_target)
+                if quality(other) > quality(best) + (config.switch_margin if is_supported(best, config) else 0.0):
+                    best = other
+        if not is_supported(best, config):
             return row, _NO_COVARIANCE
-        return refined.pose_row, refined.covariance
+        return best.pose_row, best.covariance
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from dataclasses import replace
 import numpy as np
 
 from hat_ros import lie
-from hat_ros.config import HatConfig
+from hat_ros.config import HatConfig, RefinementConfig
 from hat_ros.core.alignment import SlamAlignment
 from hat_ros.core.causal import Dissent, Fused, fuse_two, relative_motion
 from hat_ros.core.prior import extrapolate
@@ -100,7 +100,7 @@ class RefinedFusion:
         predicted = predictions[0]
         if anchor is None:
             return self._outcome(track, predicted, predicted)
-        reference = track.T_cam_target if self._is_supported(track) else predicted
+        reference = track.T_cam_target if is_supported(track, self._refinement) else predicted
         if not self._dissent.update(anchor, reference):
             self._forget_rivals()
             self._n_agreed += 1
@@ -144,7 +144,7 @@ class RefinedFusion:
         self._lead = lead if self._dissent.count == 1 else self._lead + lead
         needed = min(self._n_agreed + 1, self._alignment_config.reset_anchors)
         margin = self._refinement.arbitration_margin
-        clearly_better = self._lead >= margin and self._is_supported(rival)
+        clearly_better = self._lead >= margin and is_supported(rival, self._refinement)
         outnumbers = self._dissent.count >= needed and self._lead > -margin
         if not (clearly_better or outnumbers):
             return replace(self._outcome(track, predicted, predicted), gate_weight=self._fusion.gate_weight)
@@ -186,12 +186,12 @@ class RefinedFusion:
         Starts close to a supported pose are not tried: they would end there.
         """
         for start in starts:
-            if self._is_supported(best):
+            if is_supported(best, self._refinement):
                 apart_rad = lie.angle_between(start[:3, :3], best.T_cam_target[:3, :3])
                 if apart_rad <= np.radians(self._refinement.same_pose_deg):
                     continue
             refined = self._refiner.refine(frame, detection, start)
-            if quality(refined) > quality(best) + (lead if self._is_supported(best) else 0.0):
+            if quality(refined) > quality(best) + (lead if is_supported(best, self._refinement) else 0.0):
                 best = refined
         return best
 
@@ -202,15 +202,9 @@ class RefinedFusion:
         apart_rad = lie.angle_between(fused.measurement[:3, :3], fused.predicted[:3, :3])
         return bool(apart_rad > np.radians(2.0 * self._refinement.same_pose_deg))
 
-    def _is_supported(self, refined: Refined | None) -> bool:
-        if refined is None:
-            return False
-        overlaps = np.isnan(refined.overlap) or refined.overlap >= self._refinement.min_overlap
-        return bool(overlaps and refined.support >= self._refinement.min_support)
-
     def _outcome(self, refined: Refined | None, otherwise: Float, predicted: Float | None) -> Fused:
         """A supported refinement as a measurement, or another pose without one."""
-        if not self._is_supported(refined):
+        if not is_supported(refined, self._refinement):
             return Fused(otherwise, predicted)
         T = refined.T_cam_target
         # An unknown overlap (NaN) is never certain.
@@ -222,6 +216,14 @@ class RefinedFusion:
             covariance=refined.covariance,
             doubtful=not certain or self._n_disagreed > 1,
         )
+
+
+def is_supported(refined: Refined | None, config: RefinementConfig) -> bool:
+    """Whether the image speaks for a refined pose; without a silhouette mask the contour speaks alone."""
+    if refined is None:
+        return False
+    overlaps = np.isnan(refined.overlap) or refined.overlap >= config.min_overlap
+    return bool(overlaps and refined.support >= config.min_support)
 
 
 def quality(refined: Refined | None) -> float:
