@@ -99,7 +99,7 @@ def template_poses(target: Target) -> NDArray[np.float64]:
 
 
 def render_templates(target: Target) -> Templates:
-    """Render, crop and lift all views: about ten seconds on one core."""
+    """Render, crop and lift all views: a few seconds on one core."""
     looks, shapes = NetworkViewRenderer(target), EmbreeRenderer(target)
     # Panda3D applies K with pixel centres at +0.5, ours lie at integers.
     K = TEMPLATE_K.copy()

@@ -8,6 +8,7 @@ previous mask are best together; the paper does not publish its rule.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -23,7 +24,8 @@ from hat_ros.nets.runtime import Runtime
 from hat_ros.target import Target
 from hat_ros.types import Detection, Frame, PosePrior
 
-_N_INSTANCES = 100
+# An instance that fills more of the image than this is its background.
+_MAX_SHARE = 0.95
 
 
 class Mask2FormerSegmenter:
@@ -52,9 +54,11 @@ class Mask2FormerSegmenter:
         padded = tuple(inputs["pixel_values"].shape[-2:])
         visible = tuple(int(n) for n in inputs["pixel_mask"][0].nonzero().amax(dim=0) + 1)
         masks, scores = instances(
-            outputs.class_queries_logits[0].float(), outputs.masks_queries_logits[0].float(), padded, visible,
-            frame.rgb.shape[:2],
-        )  # fmt: skip
+            outputs.class_queries_logits[0].float(),
+            outputs.masks_queries_logits[0].float(),
+            (padded, visible, frame.rgb.shape[:2]),
+            self._settings.min_score,
+        )
         chosen = choose(masks.cpu().numpy(), scores.cpu().numpy(), self._previous, self._settings)
         if chosen is None:
             return None
@@ -69,30 +73,34 @@ class Mask2FormerSegmenter:
 def instances(
     class_logits: torch.Tensor,
     mask_logits: torch.Tensor,
-    padded_hw: tuple[int, ...],
-    visible_hw: tuple[int, ...],
-    image_hw: tuple[int, ...],
+    sizes: tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]],
+    min_score: float,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Instance masks and scores from the network's queries (the published post-processing).
+    """Instance masks and scores from the network's queries: the published post-processing without the classes.
+
+    Each query counts once, with its likeliest class, and those that cannot reach ``min_score`` are left out before
+    their masks are brought to full size.
 
     Args:
-        class_logits: (Q, C + 1), the last class is "no object". mask_logits: (Q, h, w).
-        padded_hw: network input size. visible_hw: the part of it that is image. image_hw: the original image.
+        class_logits: (Q, C + 1), the last class is "no object".
+        mask_logits: (Q, h, w).
+        sizes: (height, width) of the network's input, of the part of it that is image, and of the original image.
+        min_score: least score that is of interest.
 
     Returns:
         (N, H, W) bool masks and (N,) scores: class probability times mean mask probability inside the mask.
     """
-    probability = class_logits.softmax(dim=1)[:, :-1]
-    n_classes = probability.shape[1]
-    score, index = probability.flatten().topk(min(_N_INSTANCES, probability.numel()))
-    resize = torch.nn.functional.interpolate
-    logits = resize(mask_logits[None], size=padded_hw, mode="bilinear", align_corners=False)
-    logits = logits[..., : visible_hw[0], : visible_hw[1]]
-    logits = resize(logits, size=image_hw, mode="bilinear", align_corners=False)[0]
+    probability = class_logits.softmax(dim=1)[:, :-1].amax(dim=1)
+    kept = probability >= min_score  # the mean inside the mask is at most one
+    if not kept.any():
+        return torch.zeros(0, *sizes[2], dtype=torch.bool), torch.zeros(0)
+    padded_hw, visible_hw, image_hw = sizes
+    resize = partial(torch.nn.functional.interpolate, mode="bilinear", align_corners=False)
+    logits = resize(mask_logits[kept][None], size=padded_hw)[..., : visible_hw[0], : visible_hw[1]]
+    logits = resize(logits, size=image_hw)[0]
     masks = logits > 0
     quality = (logits.sigmoid() * masks).flatten(1).sum(dim=1) / (masks.flatten(1).sum(dim=1) + 1e-6)
-    query = index // n_classes
-    return masks[query], score * quality[query]
+    return masks, probability[kept] * quality
 
 
 def choose(
@@ -103,13 +111,13 @@ def choose(
 ) -> NDArray[np.bool_] | None:
     """The instance that is the target: (N, H, W), (N,) -> (H, W), or None.
 
-    Merit = score x square root of the area + weighted compactness (share of the convex hull that is filled) +
-    weighted overlap with the previous mask; instances that fill nearly the whole image are background.
+    Merit = score x (1 + square root of the share of the image) + weighted compactness (share of the convex hull that
+    is filled) + weighted overlap with the previous mask; instances that fill nearly the whole image are background.
     """
     best, best_merit = None, 0.0
     for mask, score in zip(masks, scores, strict=True):
         share = float(mask.mean())
-        if score < settings.min_score or not 0 < share < 0.95:
+        if score < settings.min_score or not 0 < share < _MAX_SHARE:
             continue
         merit = float(score) * (1.0 + np.sqrt(share)) + settings.compactness_weight * _compactness(mask)
         if previous is not None:

@@ -39,13 +39,21 @@ def test_instances_are_scored_by_class_and_mask_quality():
     classes = torch.tensor([[4.0, 0.0, 0.0], [0.0, 0.0, 6.0]])  # the second query says "no object"
     logits = torch.full((2, 16, 24), -8.0)
     logits[0, 4:8, 6:12] = 8.0
-    masks, scores = instances(classes, logits, (64, 96), (64, 96), (64, 96))
+    masks, scores = instances(classes, logits, ((64, 96), (64, 96), (64, 96)), 0.1)
+    assert masks.shape == (1, 64, 96), "the second query is left out"
     best = int(scores.argmax())
     expected = torch.zeros(64, 96, dtype=torch.bool)
     expected[16:32, 24:48] = True
     overlap = (masks[best] & expected).sum() / (masks[best] | expected).sum()
     assert overlap > 0.95
     assert 0.9 < float(scores[best]) < 1
+
+
+def test_no_instance_at_all():
+    classes = torch.tensor([[0.0, 0.0, 9.0]])
+    masks, scores = instances(classes, torch.ones(1, 16, 24), ((64, 96), (64, 96), (48, 72)), 0.1)
+    assert masks.shape == (0, 48, 72) and len(scores) == 0
+    assert choose(masks.numpy(), scores.numpy(), None, SETTINGS) is None
 
 
 def test_choice_prefers_the_previous_target_over_a_better_score():
