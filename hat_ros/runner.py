@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 # Segmentation backends that pass on what the recording brings; all others must find the target themselves.
 GIVEN_MASK_BACKENDS = ("annotated",)
 
+# Frames in flight in this process: a second one fills the waits of the first, more only wait for the interpreter lock.
+DEFAULT_CREDITS = 2
+
 Watcher = Callable[[int, int, TrackState], None]
 
 
@@ -44,7 +47,7 @@ class TrackOptions:
         mode: ``hat``, ``independent``, ``tracking`` or ``offline``.
         start: frames skipped at the beginning (a cold start later in the clip).
         limit: at most this many frames, None = all.
-        credits: W, frames in flight, each in a thread; None = the configuration's.
+        credits: W, frames in flight, each in a thread; None = 2, or the configuration's if that is less.
         video: write the overlay video.
         report: write ``report.html``.
         overwrite: replace a finished result folder.
@@ -83,7 +86,9 @@ def track(spec: SourceSpec, out: Path, config: HatConfig, options: TrackOptions,
     if source.count(options.start, options.limit) == 0:
         raise UsageError(f"{spec.path} has {source.count()} frames, --start {options.start} leaves none")
     method = create_method(options.mode, config, source.target)
-    pipeline = Pipeline(method, config.segmentation.backend in GIVEN_MASK_BACKENDS, config.graph.credits_replay)
+    masks_given = config.segmentation.backend in GIVEN_MASK_BACKENDS
+    credits = options.credits or min(DEFAULT_CREDITS, config.graph.credits_replay)
+    pipeline = Pipeline(method, masks_given, credits)
     how = {"mode": options.mode, "start": options.start, "limit": options.limit}
     with _result_folder(folder, spec, config, how):
         measured = _run(pipeline, source, folder, options, watch)

@@ -45,7 +45,7 @@ def _add_replay(commands: Commands) -> None:
         default="processes",
         help="five processes, or all nodes in one (default: processes)",
     )
-    _add_credits(parser)
+    _add_credits(parser, "graph.credits_replay")
     parser.add_argument("--live", action="store_true", help="play in real time; frames are dropped, not queued")
     parser.add_argument("--rate", type=float, default=1.0, metavar="X", help="speed of --live play (default: 1)")
     parser.add_argument(
@@ -58,12 +58,12 @@ def _add_replay(commands: Commands) -> None:
     parser.set_defaults(command=_replay)
 
 
-def _add_credits(parser: argparse.ArgumentParser) -> None:
+def _add_credits(parser: argparse.ArgumentParser, default: str) -> None:
     parser.add_argument(
         "--credits",
         type=positive,
         metavar="W",
-        help="frames in flight; the poses do not depend on it (default: graph.credits_replay)",
+        help=f"frames in flight; the poses do not depend on it (default: {default})",
     )
 
 
@@ -111,7 +111,7 @@ def _add_track(commands: Commands) -> None:
         "observe: front ends only, candidates at every frame, no poses "
         "(default: hat)",
     )
-    _add_credits(parser)
+    _add_credits(parser, "2, or graph.credits_replay where that is less")
     add_extent(parser)
     add_threads(parser)
     parser.set_defaults(command=_track)
