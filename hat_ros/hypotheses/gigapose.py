@@ -46,6 +46,7 @@ class GigaPoseHypotheses:
         self._describe = self._runtime.wrap(self._net.ae_net)
         self._describe_ist = self._runtime.wrap(self._net.ist_net.backbone)
         key = f"{_FORMAT}:{target.sha256}:{fingerprint(state)}"
+        del state  # gigabytes that would lie beside the network while templates are encoded
         arrays = cached_arrays("gigapose", key, lambda: self._build(target))
         self._templates = {name: self._runtime.tensor(array) for name, array in arrays.items()}
 

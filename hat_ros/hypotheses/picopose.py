@@ -54,7 +54,9 @@ class PicoPoseHypotheses:
         load_into(self._net, state, "picopose")
         self._runtime.place(self._net)
         self._extract = self._runtime.wrap(self._net.feature_extractor)
-        self._load_templates(target, fingerprint(state))
+        weights = fingerprint(state)
+        del state  # gigabytes that would lie beside the network while templates are encoded
+        self._load_templates(target, weights)
 
     def _load_templates(self, target: Target, weights: str) -> None:
         arrays = cached_arrays("picopose", f"{_FORMAT}:{target.sha256}:{weights}", lambda: self._build(target))

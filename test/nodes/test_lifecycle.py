@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,11 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 
 import hat_ros
-from hat_ros.errors import ConfigError
+from hat_ros.config import config_from_dict
+from hat_ros.errors import ConfigError, StageTimeoutError
 from hat_ros.nodes import base, images, process, topics, wire
 from hat_ros.nodes.overlay_node import OverlayNode
+from hat_ros.nodes.player_node import PlayerNode
 from hat_ros.nodes.recorder_node import RecorderNode
 from hat_ros.nodes.selector_node import SelectorNode
 from hat_ros.nodes.slam_node import SlamNode
@@ -64,6 +67,48 @@ def test_a_node_that_cannot_be_configured_says_why_and_stays_unconfigured(execut
     assert state_of(node) == "unconfigured"
     assert isinstance(node.failure, ConfigError)
     assert "parameter 'target' is empty" in str(node.failure)
+
+
+class PreparingNode(SelectorNode):
+    """Says what it does while it configures, as the learned backends do."""
+
+    def configure(self):
+        logging.getLogger("hat_ros.hypotheses.any").info("encoded %d of %d templates", 8, 162)
+        self.text_meanwhile = self._text
+        super().configure()
+
+
+def test_long_preparations_show_in_diagnostics_while_they_last(executor, caplog):
+    node = add(executor, PreparingNode)
+    handlers = list(logging.getLogger("hat_ros").handlers)
+    with caplog.at_level(logging.INFO, "hat_ros"):
+        node.start()
+    assert node.text_meanwhile == "busy: encoded 8 of 162 templates"
+    assert node._text == "waiting for the other nodes"
+    assert logging.getLogger("hat_ros").handlers == handlers
+
+
+def test_a_node_that_says_something_new_is_not_given_up(executor, clean_bag):
+    player = add(executor, PlayerNode, bag=str(clean_bag), config="default")
+    player.start()
+    progress = []
+    for text in ("busy: 8 of 162", "busy: 8 of 162", "busy: 16 of 162"):
+        player.progress_s = 0.0
+        player._on_diagnostics(player.wire.diagnostics(0, "hat: hypotheses", base.OK, text, {}))
+        progress.append(player.progress_s > 0.0)
+    assert progress == [True, False, True]
+    player.progress_s = 0.0
+    with pytest.raises(StageTimeoutError, match=r"hypotheses: busy: 16 of 162.*raise graph\.startup_timeout_s"):
+        player._feed()
+
+
+def test_the_first_frame_has_the_longer_of_two_limits():
+    limits = {"stage_timeout_s": 30.0, "startup_timeout_s": 180.0}
+    config = config_from_dict({"graph": limits}).graph
+    assert base.answer_limit(config, first=True) == (180.0, "graph.startup_timeout_s")
+    assert base.answer_limit(config, first=False) == (30.0, "graph.stage_timeout_s")
+    slow = config_from_dict({"graph": {**limits, "stage_timeout_s": 900.0}}).graph
+    assert base.answer_limit(slow, first=True) == (900.0, "graph.stage_timeout_s")
 
 
 def spin_until(executor, condition, turns=200):
