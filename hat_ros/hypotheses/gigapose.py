@@ -9,7 +9,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hat_ros import lie
 from hat_ros.cache import cached_arrays
 from hat_ros.config import HatConfig
 from hat_ros.hypotheses.megapose import MegaPose
@@ -88,10 +87,7 @@ class GigaPoseHypotheses:
         affine = torch.stack([self._affine(ist, bank["ist"][i].flatten(1), matches[i]) for i in best])
         K = tensor(frame.camera.K)
         T = pp.affine_pose(affine, tensor(M), K, bank["T_cam_target"][best], bank["M"][best], tensor(TEMPLATE_K))
-        T, logits = self._megapose.refine(self._runtime.image(frame.rgb), K, T)
-        T, logits = T.double().cpu().numpy(), logits.double().cpu().numpy()
-        rigid = lie.is_rigid(T)
-        return Candidates.from_matrices(T[rigid], logits[rigid], detection.box_xyxy)
+        return self._megapose.candidates(self._runtime.image(frame.rgb), K, T, detection)
 
     def reset(self) -> None:
         """Nothing is learned from earlier frames."""

@@ -69,6 +69,12 @@ class MegaPose:
             T = mp.refine_once(self._refiner, image, K, T, self.points, self.renderer)
         return T, mp.score_coarse(self._coarse, image, K, T, self.points, self.renderer)
 
+    def candidates(self, image: Tensor, K: Tensor, T_cam_target: Tensor, detection: Detection) -> Candidates:
+        """:meth:`refine` as candidates; a pose that the updates drove out of all bounds is none."""
+        T, logits = (found.double().cpu().numpy() for found in self.refine(image, K, T_cam_target))
+        rigid = lie.is_rigid(T)
+        return Candidates.from_matrices(T[rigid], logits[rigid], detection.box_xyxy)
+
     @torch.inference_mode()
     def score_prepared(self, image: Tensor, boxes: Tensor, renders: Tensor) -> Tensor:
         """Coarse logits of ready uint8 renders, in batches: (3, H, W), (B, 4), (B, 6, 240, 320) -> (B,)."""
@@ -98,8 +104,7 @@ class MegaPoseHypotheses:
         boxes = mp.crop_boxes(mp.orthonormalise(T), K.expand(len(T), 3, 3), self._megapose.points.crop, image.shape[1:])
         logits = self._megapose.score_prepared(image, boxes, self._coarse_views(frame.camera))
         best = logits.topk(min(self._n_candidates, len(logits))).indices
-        T, logits = self._megapose.refine(image, K, T[best])
-        return Candidates.from_matrices(T.double().cpu().numpy(), logits.double().cpu().numpy(), detection.box_xyxy)
+        return self._megapose.candidates(image, K, T[best], detection)
 
     def reset(self) -> None:
         """Nothing is learned from earlier frames."""

@@ -101,7 +101,8 @@ class PicoPoseHypotheses:
             solved = solve_pose(source, at, self._points_m[int(best[i])], crop.M, frame.camera.K, self._settings)
             if solved is not None:
                 T[i], score[i] = solved
-        return Candidates.from_matrices(T, score, detection.box_xyxy)
+        rigid = lie.is_rigid(T)  # an affine of no size has no pose to fall back on
+        return Candidates.from_matrices(T[rigid], score[rigid], detection.box_xyxy)
 
     def reset(self) -> None:
         """Nothing is learned from earlier frames."""

@@ -8,6 +8,7 @@ over a leading axis B and work on any device.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
@@ -143,7 +144,7 @@ def _interpolation_rows(start: Tensor, end: Tensor, n_out: int, n_in: int) -> Te
     index = torch.arange(n_out, dtype=start.dtype, device=start.device)
     at = start[:, None, None] + (index[:, None] + sub) * bin_size[:, None, None]
     inside = (at >= -1) & (at <= n_in)
-    at = at.clamp(0, n_in - 1)
+    at = torch.where(inside, at, 0.0).clamp(0, n_in - 1)
     low = at.floor().clamp(max=n_in - 1)
     high = (low + 1).clamp(max=n_in - 1)
     upper = at - low
@@ -157,12 +158,23 @@ def roi_align(image: Tensor, boxes: Tensor) -> Tensor:
     """RoIAlign (sampling ratio 4, not half-pixel aligned) of one image: (C, H, W), (B, 4) -> (B, C, 240, 320).
 
     Bilinear weights and the zero outside the image are products of one factor per axis, so the crop is two matrix
-    products instead of a gather of 16 samples per pixel. He et al., "Mask R-CNN", ICCV 2017.
+    products, over the part of the image that any box reaches, instead of a gather of 16 samples per pixel. He et al.,
+    "Mask R-CNN", ICCV 2017.
     """
     _, height, width = image.shape
-    rows = _interpolation_rows(boxes[:, 1], boxes[:, 3], CROP_HEIGHT, height)
-    cols = _interpolation_rows(boxes[:, 0], boxes[:, 2], CROP_WIDTH, width)
-    return torch.einsum("byh,chw,bxw->bcyx", rows, image, cols)
+    x0, x1 = _reached(boxes[:, 0], boxes[:, 2], width)
+    y0, y1 = _reached(boxes[:, 1], boxes[:, 3], height)
+    rows = _interpolation_rows(boxes[:, 1] - y0, boxes[:, 3] - y0, CROP_HEIGHT, y1 - y0)
+    cols = _interpolation_rows(boxes[:, 0] - x0, boxes[:, 2] - x0, CROP_WIDTH, x1 - x0)
+    return torch.einsum("byh,chw,bxw->bcyx", rows, image[:, y0:y1, x0:x1], cols)
+
+
+def _reached(start: Tensor, end: Tensor, size: int) -> tuple[int, int]:
+    """Half-open pixel range along one axis outside which no box samples; where it ends before the image does, so far
+    out that no sample is clamped there."""
+    low = float((start.min() - 2).nan_to_num(0.0).clamp(0, size - 1))
+    high = float((torch.maximum(end, start + 1).max() + 3).nan_to_num(size).clamp(1, size))
+    return math.floor(low), max(math.ceil(high), math.floor(low) + 1)
 
 
 def extra_views(T_cam_target: Tensor) -> Tensor:

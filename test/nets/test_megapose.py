@@ -86,6 +86,19 @@ def test_roi_align_is_zero_outside_and_exact_on_a_ramp():
     assert float(outside.abs().max()) == 0
 
 
+def test_a_crop_does_not_depend_on_the_others_beside_it():
+    """Crops look at the part of the image that any of them reaches; more of it must change nothing."""
+    image = torch.rand(3, 60, 90, generator=torch.Generator().manual_seed(0))
+    boxes = torch.tensor(
+        [[20.0, 10, 50, 40], [-15.5, -8, 12, 20], [70, 40, 140, 95], [-50, -50, 150, 120], [30.2, 30.1, 30.5, 30.4],
+         [200, 10, 230, 40], [10, 200, 40, 220], [88.9, 58.9, 92, 62]]
+    )  # fmt: skip
+    together = mp.roi_align(image, boxes)
+    for i in range(len(boxes)):
+        torch.testing.assert_close(mp.roi_align(image, boxes[i : i + 1])[0], together[i], atol=1e-4, rtol=0)
+    assert mp.roi_align(image, torch.full((1, 4), float("nan"))).shape == (1, 3, 240, 320)
+
+
 def test_refiner_iteration(coarse, refiner):
     net = rule_filled(mp.RefinerNet())
     T = mp.orthonormalise(tensor(refiner["TCO_input"]))
