@@ -81,8 +81,11 @@ def test_stages_of_every_frame_are_attributed(clip):
     assert measured.fps > 0 and np.isnan(measured.device_memory_mib) and measured.host_memory_mib > 1
 
 
-def test_megapose_passes_and_renders_add_up(clip, tmp_path, monkeypatch):
-    pytest.importorskip("torch")
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_megapose_passes_and_renders_add_up(clip, tmp_path, monkeypatch, device):
+    torch = pytest.importorskip("torch")
+    if device == "cuda" and not torch.cuda.is_available():
+        pytest.skip("needs CUDA")
     from rule_weights import save_rule_weights
 
     from hat_ros.hypotheses import megapose
@@ -100,7 +103,7 @@ def test_megapose_passes_and_renders_add_up(clip, tmp_path, monkeypatch):
         "segmentation.backend": "annotated",
         "keyframes.gap_frames": GAP,
         "nets.weights_folder": tmp_path,
-        "nets.device": "cpu",
+        "nets.device": device,
     }
     config = load_config("default", [f"{key}={value}" for key, value in settings.items()])
     measured = profile(open_source(clip), config, limit=GAP + 1)
@@ -112,6 +115,7 @@ def test_megapose_passes_and_renders_add_up(clip, tmp_path, monkeypatch):
     assert found["crops"] == found["coarse network"] + found["refiner network"]
     assert measured.start["  renders"].images == found["renders"] + n_grid, "the grid is rendered once"
     assert measured.between["  coarse network"].calls == 0
+    assert np.isnan(measured.device_memory_mib) if device == "cpu" else measured.device_memory_mib > 1
 
 
 def test_a_clip_without_keyframes_says_so(clip):

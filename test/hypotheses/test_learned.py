@@ -73,6 +73,23 @@ def test_megapose_gives_k_rigid_poses_and_renders_its_grid_once(target, frame, d
     np.testing.assert_array_equal(again.pose_rows, first.pose_rows)
 
 
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+@pytest.mark.parametrize(("precision", "tolerance"), [("float32", 1e-2), ("float16", 0.2)])
+def test_megapose_on_a_gpu_agrees_with_the_cpu(target, frame, detection, tmp_path, monkeypatch, precision, tolerance):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    save_rule_weights(tmp_path, "megapose_coarse", mp.CoarseNet())
+    save_rule_weights(tmp_path, "megapose_refiner", mp.RefinerNet())
+    monkeypatch.setattr(megapose, "so3_grid", lambda level: np.eye(4)[:, [3, 0, 1, 2]])
+    found = []
+    for device in ("cpu", "cuda"):
+        settings = {"max_candidates": 4, "megapose": {"refiner_iterations": 0}}  # random updates amplify differences
+        nets = {"weights_folder": str(tmp_path), "device": device, "precision": precision}
+        config = config_from_dict({"hypotheses": settings, "nets": nets})
+        found.append(megapose.MegaPoseHypotheses(config, target).generate(frame, detection, None))
+    np.testing.assert_allclose(found[1].log_score, found[0].log_score, atol=tolerance)
+
+
 def test_few_vertices_are_made_up_for_by_surface_points(target):
     points = megapose.crop_points(target, Runtime(config_from_dict({}).nets))
     assert points.crop.shape == (2000, 3)
