@@ -1,8 +1,8 @@
 """Public network weights: where they come from, where they go, and how they are read safely.
 
-Nothing is ever downloaded. A checkpoint is looked for in one folder, ``--weights``, else ``$HAT_WEIGHTS``, else
-``$XDG_DATA_HOME/hat_ros/weights``. A pickled file is opened only after its SHA-256 agrees with the published one, and
-then with ``weights_only=True``; safetensors hold no code, so for them names and shapes are the whole check.
+Nothing is ever downloaded. A checkpoint is looked for in one folder: ``nets.weights_folder``, else ``$HAT_WEIGHTS``,
+else ``$XDG_DATA_HOME/hat_ros/weights``. A pickled file is opened only after its SHA-256 agrees with the published one,
+and then with ``weights_only=True``; safetensors hold no code, so for them names and shapes are the whole check.
 :func:`convert` turns a pickled file into safetensors once, reading it without running anything that it names.
 
 This module imports torch and safetensors only inside the functions that read tensors, so that listing and checking
@@ -83,7 +83,7 @@ def find(name: str, folder: str | Path | None = None) -> Path:
     raise WeightsError(
         f"{name}: neither {entry.filename} nor {entry.converted_filename} is in {root}; get {entry.filename} from "
         f"{entry.source} (SHA-256 {entry.sha256 or _NO_CHECKSUM}, licence: {entry.licence}) and put it there, or "
-        f"point --weights or HAT_WEIGHTS at the folder that holds it"
+        f"point HAT_WEIGHTS or nets.weights_folder at the folder that holds it"
     )
 
 
