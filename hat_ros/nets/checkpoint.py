@@ -80,8 +80,11 @@ def find(name: str, folder: str | Path | None = None) -> Path:
         found = [path for path in (root / entry.converted_filename, root / entry.filename) if path.is_file()]
     if found:
         return found[0]
+    names = f"the folder {entry.filename} is not"
+    if not entry.library_folder:
+        names = f"neither {entry.filename} nor {entry.converted_filename} is"
     raise WeightsError(
-        f"{name}: neither {entry.filename} nor {entry.converted_filename} is in {root}; get {entry.filename} from "
+        f"{name}: {names} in {root}; get {entry.filename} from "
         f"{entry.source} (SHA-256 {entry.sha256 or _NO_CHECKSUM}, licence: {entry.licence}) and put it there, or "
         f"point HAT_WEIGHTS or nets.weights_folder at the folder that holds it"
     )
