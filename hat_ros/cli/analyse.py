@@ -115,6 +115,9 @@ def _add_campaign(parser: argparse.ArgumentParser) -> None:
     add_dataset(parser)
     parser.add_argument("--root", type=Path, metavar="DIR", help="root folder of the --dataset; no bags are written")
     parser.add_argument("--sequence", action="append", default=[], metavar="NAME", help="only this one (repeatable)")
+    parser.add_argument(
+        "--suite", type=Path, metavar="DIR", help="all clips that `hat synth suite --out DIR` wrote, with its settings"
+    )
     parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="campaign folder; resumed if it exists")
     add_config(parser)
     parser.add_argument("--limit", type=positive, metavar="N", help="at most N frames per run")
@@ -129,19 +132,21 @@ def _add_campaign(parser: argparse.ArgumentParser) -> None:
 def _clips(arguments: argparse.Namespace) -> list[tuple[SourceSpec, tuple[str, ...]]]:
     """The recordings that the arguments name."""
     from hat_ros.errors import UsageError
-    from hat_ros.evaluation.bench import clips_named, clips_of_dataset
+    from hat_ros.evaluation.bench import clips_named, clips_of_dataset, clips_of_suite
 
     if bool(arguments.dataset) != (arguments.root is not None):
         raise UsageError("--dataset and --root belong together: name the layout and the folder of the data set")
     if arguments.detections is not None and not arguments.dataset:
         raise UsageError("--detections belong to the --dataset; import a clip with its own (`hat import --detections`)")
     clips = clips_named(arguments.recordings)
+    if arguments.suite is not None:
+        clips += clips_of_suite(arguments.suite)
     if arguments.dataset:
         clips += clips_of_dataset(
             arguments.dataset, arguments.root, arguments.model, arguments.sequence, arguments.detections
         )
     if not clips:
-        raise UsageError("nothing to run: name bags or sequence folders, or a --dataset and its --root")
+        raise UsageError("nothing to run: name bags or sequence folders, a --suite, or a --dataset and its --root")
     return clips
 
 

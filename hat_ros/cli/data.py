@@ -95,6 +95,7 @@ def _add_synth(commands: Commands) -> None:
         "--format", choices=("bag", "sequence"), default="bag", help="rosbag2 folder or images + labels"
     )
     parser.add_argument("--scale", type=float, default=1.0, metavar="S", help="image size of clips and suite, times S")
+    parser.add_argument("--width", type=positive, metavar="PX", help="images of the suite at most this wide")
     parser.add_argument("--limit", type=positive, metavar="N", help="at most N frames per clip of the suite")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     film = parser.add_argument_group("how a model is filmed")
@@ -146,7 +147,8 @@ def _synth(arguments: argparse.Namespace) -> int:
         raise UsageError("synth: --out is missing; it names what to write")
     with count_progress(arguments.quiet) as watch:
         if what == "suite":
-            groups = suite.write_suite(arguments.out, scale=arguments.scale, limit=arguments.limit, progress=watch)
+            size = {"scale": arguments.scale, "width_px": arguments.width, "limit": arguments.limit}
+            groups = suite.write_suite(arguments.out, **size, progress=watch)
             written = [bag for bags in groups.values() for bag in bags]
         else:
             clip = suite.CLIPS[what].scaled(arguments.scale) if what in suite.CLIPS else _filmed(arguments)

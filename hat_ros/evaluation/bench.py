@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from hat_ros.datasets.importer import detections_by_sequence, open_dataset
+from hat_ros.datasets.suite import SUITE, SUITE_SETTINGS
 from hat_ros.errors import UsageError
 from hat_ros.evaluation import metrics
 from hat_ros.evaluation.campaign import Job, Outcome
@@ -77,6 +78,23 @@ def clips_named(texts: Sequence[str]) -> list[tuple[SourceSpec, tuple[str, ...]]
     return clips
 
 
+def clips_of_suite(root: Path) -> list[tuple[SourceSpec, tuple[str, ...]]]:
+    """The bags that ``hat synth suite`` wrote, with the settings that belong to their group.
+
+    Raises:
+        UsageError: there is none.
+    """
+    clips = [
+        (SourceSpec((root / group / name).resolve()), SUITE_SETTINGS.get(group, ()))
+        for group, names in SUITE.items()
+        for name in names
+        if (root / group / name).exists()
+    ]
+    if not clips:
+        raise UsageError(f"--suite {root}: no clip of the suite is there; `hat synth suite --out {root}` renders it")
+    return clips
+
+
 def clips_of_dataset(
     dataset: str, root: Path, model: Path | None, sequences: Sequence[str], detections: Path | None = None
 ) -> list[tuple[SourceSpec, tuple[str, ...]]]:
@@ -119,7 +137,8 @@ def bench_jobs(
     """
     jobs: dict[str, Job] = {}
     for spec, own_settings in clips:
-        for mask in masks:
+        # A clip that is meant to be run with its own masks has no other.
+        for mask in ("given",) if set(GIVEN_MASKS) <= set(own_settings) else masks:
             for start in starts:
                 for mode in modes:
                     name = f"{spec.name}-{mode}-{mask}-{start}"

@@ -228,6 +228,13 @@ def test_scaling_keeps_the_field_of_view():
     assert half.width / half.focal_px == pytest.approx(clip.spec.width / clip.spec.focal_px)
 
 
+def test_a_width_limits_only_what_is_wider():
+    spark, ycbv = get_clip("spark_observer"), get_clip("ycbv_probe")
+    assert (spark.within(720).spec.width, spark.within(720).spec.height) == (720, 540)
+    assert ycbv.within(720).spec == ycbv.spec
+    assert spark.within(None) == spark
+
+
 def test_suite_is_written_as_bags_and_resumed(tmp_path):
     bags = write_suite(tmp_path / "suite", ["swisscube"], scale=0.1, limit=2)
     assert [bag.name for bag in bags["swisscube"]] == list(SUITE["swisscube"])

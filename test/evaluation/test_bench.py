@@ -12,7 +12,15 @@ from hat_ros.bag import BagWriter
 from hat_ros.datasets.models import write_model
 from hat_ros.errors import MissingDependencyError, RunError, UsageError
 from hat_ros.evaluation import campaign
-from hat_ros.evaluation.bench import bench_jobs, bench_table, clips_named, failures, group_table, stage_table
+from hat_ros.evaluation.bench import (
+    bench_jobs,
+    bench_table,
+    clips_named,
+    clips_of_suite,
+    failures,
+    group_table,
+    stage_table,
+)
 from hat_ros.evaluation.campaign import Job, run_campaign
 from hat_ros.results import METRICS_FILE, RUN_FILE
 
@@ -83,6 +91,19 @@ def test_one_clip_may_have_settings_of_its_own(clips):
     jobs = bench_jobs(named, ["hat"], ["own"], [0], "default")
     assert jobs[0].overrides == ()
     assert jobs[1].overrides == ("slam.masked=false", "keyframes.gap_frames=2")
+
+
+def test_suite_clips_come_with_the_settings_of_their_group(tmp_path):
+    for group, name in (("ycbv", "ycbv_probe"), ("spark", "spark_observer"), ("spark", "a_stranger")):
+        (tmp_path / group / name).mkdir(parents=True)
+    named = clips_of_suite(tmp_path)
+    assert [spec.name for spec, _ in named] == ["spark_observer", "ycbv_probe"]
+    jobs = bench_jobs(named, ["hat"], ["own", "given"], [0], "default")
+    told = [(job.labels["group"], job.labels["masks"]) for job in jobs]
+    assert told == [("spark", "own"), ("spark", "given"), ("ycbv", "given")]
+    assert "slam.masked=false" in jobs[2].overrides
+    with pytest.raises(UsageError, match="hat synth suite"):
+        clips_of_suite(tmp_path / "spark")
 
 
 def test_missing_or_ambiguous_clips_are_refused(clips, tmp_path):
