@@ -18,8 +18,8 @@ import numpy as np
 
 from hat_ros.core.sync import Admission
 from hat_ros.errors import FrameError
-from hat_ros.evaluation.metrics import mask_iou
 from hat_ros.methods import Method
+from hat_ros.segmentation.masks import overlap
 from hat_ros.tracker import Step
 from hat_ros.turnstile import Turnstiles
 from hat_ros.types import Frame
@@ -145,7 +145,7 @@ class Pipeline:
         latency_ms, iou = 1e3 * (time.perf_counter() - start), float("nan")
         looked = step.detection is not None or "segmentation" in stage_ms
         if looked and frame.given_mask is not None and (silhouette := frame.given_mask == 255).any():
-            iou = mask_iou(None if step.detection is None else step.detection.mask, silhouette)
+            iou = 0.0 if step.detection is None else overlap(step.detection.mask, silhouette)
         stage_ms = {name: stage_ms.get(name, 0.0) for name in STAGE_NAMES}
         return Processed(frame, step, latency_ms, decode_ms, stage_ms, resident_mib(), iou)
 

@@ -261,17 +261,6 @@ def relative_motion_deg(pose_rows: Float, valid: Bool, epoch: NDArray[np.int64],
     return np.degrees(lie.angle_between(step[usable], step_true[usable]))
 
 
-def mask_iou(mask: Bool | None, truth: Bool) -> float:
-    """Intersection over union of a detected and a true silhouette; 0 when nothing was found, NaN without a target."""
-    n_truth = int(np.count_nonzero(truth))
-    if n_truth == 0:
-        return float("nan")
-    if mask is None:
-        return 0.0
-    both = int(np.count_nonzero(mask & truth))
-    return both / (int(np.count_nonzero(mask)) + n_truth - both)
-
-
 def mask_summary(iou: Float) -> dict[str, float]:
     """Mean overlap and share of frames at 0.9 or better."""
     iou = iou[np.isfinite(iou)]
