@@ -66,8 +66,9 @@ class Runtime:
         return run
 
     def tensor(self, array: NDArray) -> torch.Tensor:
-        """float32 tensor on the device."""
-        return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(self.device)
+        """float32 tensor on the device; an array that may not be written, such as a mapped file, is copied."""
+        values = np.ascontiguousarray(array, dtype=np.float32)
+        return torch.from_numpy(values if values.flags.writeable else values.copy()).to(self.device)
 
     def image(self, rgb: NDArray[np.uint8]) -> torch.Tensor:
         """(H, W, 3) uint8 -> (3, H, W) float32 in [0, 1] on the device; moved as bytes."""

@@ -1,5 +1,6 @@
 """Where networks run and in what arithmetic."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -33,6 +34,14 @@ def test_batches_cover_every_image_once(n_images, size):
     batches = list(Runtime(NetsConfig(device="cpu")).batches(n_images, size))
     assert [i for batch in batches for i in range(n_images)[batch]] == list(range(n_images))
     assert all(batch.stop - batch.start <= size for batch in batches)
+
+
+def test_tensors_of_read_only_arrays_are_copies(recwarn):
+    array = np.arange(3, dtype=np.float32)
+    array.flags.writeable = False
+    tensor = Runtime(NetsConfig(device="cpu")).tensor(array)
+    tensor[0] = 7
+    assert array[0] == 0 and not recwarn.list
 
 
 def test_a_placed_network_gives_the_same_numbers_and_needs_no_gradient():
