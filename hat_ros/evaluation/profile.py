@@ -32,7 +32,8 @@ class Part:
     Attributes:
         name: for tables; parts of a stage are indented below it.
         where: ``module:function`` or ``module:Class.method``, where callers look it up.
-        counted: which argument's length (``self`` apart) is the number of images; None counts each call as one.
+        counted: which argument (``self`` apart) has as many rows as there are images, or is a list of such; None counts
+            each call as one.
     """
 
     name: str
@@ -60,8 +61,8 @@ PARTS = {
         _TRANSFORMER,
         Part("  retrieval", "hat_ros.nets.picopose:match_templates"),
         Part("  affine network", "hat_ros.nets.picopose:AffineRegressor.forward", 0),
-        Part("  feature head", "hat_ros.nets.picopose_offset:DptHead.forward"),
-        Part("  flow decoder", "hat_ros.nets.picopose_offset:FlowDecoder.forward"),
+        Part("  feature head", "hat_ros.nets.picopose_offset:DptHead.forward", 0),
+        Part("  flow decoder", "hat_ros.nets.picopose_offset:FlowDecoder.forward", 0),
         Part("  PnP", "hat_ros.hypotheses.picopose:solve_pose"),
     ),
     "gigapose": (
@@ -155,12 +156,16 @@ class Meter:
                 return call(*args, **kwargs)
             finally:
                 self._wait()
-                images = 1 if index is None else len(args[index])
+                images = 1 if index is None else _rows(args[index])
                 tally = self._tallies[part.name]
                 tally.calls, tally.images = tally.calls + 1, tally.images + images
                 tally.seconds += time.perf_counter() - start
 
         return measured
+
+
+def _rows(argument: Any) -> int:
+    return len(argument[0] if isinstance(argument, (list, tuple)) else argument)
 
 
 @dataclass(frozen=True)
