@@ -68,7 +68,7 @@ PARTS = {
     "gigapose": (
         _TEMPLATES,
         _TRANSFORMER,
-        Part("  second network", "hat_ros.nets.gigapose:_IstBackbone.forward", 0),
+        Part("  second network", "hat_ros.nets.gigapose:IstBackbone.forward", 0),
         Part("  matching", "hat_ros.nets.gigapose:match"),
         *_MEGAPOSE,
     ),

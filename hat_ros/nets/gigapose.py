@@ -34,7 +34,9 @@ class _AeNet(nn.Module):
         return F.normalize(self.dinov2_model(crops, (_LAST_BLOCK,))[0], dim=1)
 
 
-class _IstBackbone(nn.Module):
+class IstBackbone(nn.Module):
+    """The second network's features: (B, 3, 224, 224) crops -> (B, 256, 16, 16)."""
+
     def __init__(self) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(3, 128, 7, 2, 3, bias=False)
@@ -47,6 +49,7 @@ class _IstBackbone(nn.Module):
         self.layer4_outconv = nn.Conv2d(512, 256, 1, bias=False)
 
     def forward(self, crops: Tensor) -> Tensor:
+        """One feature per patch."""
         x = F.interpolate(crops, size=(_IST_PX, _IST_PX), mode="bilinear", align_corners=True)
         x = torch.relu(self.bn1(self.conv1(x)))
         return self.layer4_outconv(self.layer4(self.layer3(self.layer2(self.layer1(x)))))
@@ -72,7 +75,7 @@ class _Regressor(nn.Module):
 class _IstNet(nn.Module):
     def __init__(self) -> None:
         super().__init__()
-        self.backbone = _IstBackbone()
+        self.backbone = IstBackbone()
         self.regressor = _Regressor()
 
 
