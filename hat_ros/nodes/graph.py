@@ -246,7 +246,7 @@ class _Run:
             if code is not None and not (code == 0 and self._player.finished):
                 raise self._death(name, code)
         for node in self._nodes:
-            if isinstance(node.failure, StageTimeoutError):
+            if isinstance(node.failure, StageTimeoutError) and self._player.published:
                 raise StageTimeoutError(f"{node.failure}: {self._culprit()}") from None
             if node.failure is not None:
                 raise node.failure
