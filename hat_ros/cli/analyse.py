@@ -275,7 +275,8 @@ _ABLATE_TABLES = """\
 tables, each as NAME.txt, .csv, .tex, .json, .png and .svg below --out:
   components    what each part of the method adds, row by row
   sensitivity   anchor stride, K, s0, D, w: one setting at a time
-  selectors     the decoder, best appearance, a particle filter, a UKF, the offline backtrace
+  selectors     best appearance, the decoder, the offline backtrace, and a particle filter and a UKF at their best
+  filters       the search for that best
   offline       independent, causal and offline poses from the same observations
   by_clip       the same, E_p clip by clip
   masks         motion from the masked target and from raw frames

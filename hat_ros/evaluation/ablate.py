@@ -7,7 +7,7 @@ The front ends run once per clip (``--mode observe``, candidates at every frame)
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from hat_ros.config import HatConfig, flat_options, load_config
 from hat_ros.errors import RunError, UsageError
 from hat_ros.evaluation import metrics
 from hat_ros.evaluation.campaign import Job, Outcome
-from hat_ros.evaluation.filters import ParticleSelector, UkfSelector
+from hat_ros.evaluation.filters import FilterNoise, ParticleSelector, UkfSelector
 from hat_ros.evaluation.runlog import RunLog
 from hat_ros.evaluation.tables import Column, Table
 from hat_ros.evaluation.temporal_replay import replay_offline, replay_temporal
@@ -33,6 +33,8 @@ CANDIDATE_COUNTS = (5, 10)
 SIZE_REFERENCES_PX = (300.0, 400.0, 500.0, 600.0)
 GATE_ANGLES_DEG = (45.0, 75.0, 120.0, GATE_OFF_DEG)
 RELATIVE_WEIGHTS = (0.05, 0.1, 0.25, 0.5)
+FILTER_MOTION_DEG = (1.0, 3.0, 10.0)
+FILTER_CANDIDATE_DEG = (3.0, 10.0, 30.0)
 
 # kind, mode, settings of the runs that everything else is made from.
 _RUNS = (
@@ -72,25 +74,29 @@ class Row:
         config: temporal settings.
         offline: the offline reference, else the causal stages.
         selector: ``viterbi``, ``particles`` or ``ukf``.
+        noise: of a filter; None for the decoder.
     """
 
     name: str
     config: HatConfig
     offline: bool = False
     selector: str = "viterbi"
+    noise: FilterNoise | None = None
 
     def replay(self, log: RunLog) -> RunLog:
         """The row's answer to one clip."""
         if self.offline:
             return replay_offline(log, self.config)
         stand_in = _SELECTORS[self.selector]
-        return replay_temporal(log, self.config, stand_in and stand_in(self.config.selector))
+        return replay_temporal(log, self.config, stand_in and stand_in(self.config.selector, self.noise))
 
     def settings(self, base: HatConfig) -> dict[str, Any]:
         """What differs from the configuration of the campaign, and what ran."""
         usual = {key: value for key, (value, _) in flat_options(base).items()}
         changed = {key: v for key, (v, _) in flat_options(self.config).items() if v != usual[key]}
-        return {"name": self.name, "offline": self.offline, "selector": self.selector, "settings": changed}
+        noise = None if self.noise is None else asdict(self.noise)
+        ran = {"offline": self.offline, "selector": self.selector, "noise": noise}
+        return {"name": self.name, **ran, "settings": changed}
 
 
 @dataclass(frozen=True)
@@ -188,6 +194,7 @@ def tables(plan: Plan, outcomes: Sequence[Outcome]) -> dict[str, Table]:
     rows = table_rows(config)
     tracking = {"name": "tracking (refine the last pose)", **pooled(logs["tracking"])}
     components = table_of("Cumulative components, causal throughout", rows["components"], masked)
+    filters = table_of("Search for the best filters", rows["filters"], masked)
     masks = [
         {"name": name, **pooled([replay_temporal(log, config) for log in logs[kind]])}
         for name, kind in (("target masked for motion", "masked"), ("raw frames for motion", "unmasked"))
@@ -195,7 +202,8 @@ def tables(plan: Plan, outcomes: Sequence[Outcome]) -> dict[str, Table]:
     return {
         "components": with_change(replace(components, rows=[tracking, *components.rows])),
         "sensitivity": table_of("Sensitivity, one setting at a time", rows["sensitivity"], masked),
-        "selectors": table_of("Selection at keyframes", rows["selectors"], masked),
+        "selectors": with_best_filters(table_of("Selection at keyframes", rows["selectors"], masked), filters),
+        "filters": filters,
         "offline": table_of("Causal and offline on the same observations", rows["offline"], masked),
         "by_clip": clip_table(rows["offline"], dict(zip(dict.fromkeys(clips), masked, strict=True))),
         "masks": Table("Background masking of the motion estimate", _COLUMNS, masks),
@@ -208,6 +216,7 @@ def table_rows(config: HatConfig) -> dict[str, list[Row]]:
         "components": component_rows(config),
         "sensitivity": sweep_rows(config),
         "selectors": selector_rows(config),
+        "filters": filter_rows(config),
         "offline": reference_rows(config),
     }
 
@@ -275,10 +284,33 @@ def selector_rows(config: HatConfig) -> list[Row]:
     return [
         Row("best appearance", _with(config, selector=_BEST_APPEARANCE)),
         Row("forward Viterbi", config),
-        Row("particle filter on SO(3)", config, selector="particles"),
-        Row("UKF", config, selector="ukf"),
         Row("offline backtrace", config, offline=True),
     ]
+
+
+def filter_rows(config: HatConfig) -> list[Row]:
+    """The particle filter and the UKF under every setting of a search, so that each can show its best."""
+    return [
+        Row(
+            f"{title}, motion {motion_deg:g} deg, candidates {candidate_deg:g} deg",
+            config,
+            selector=selector,
+            noise=FilterNoise(motion_deg=motion_deg, candidate_deg=candidate_deg),
+        )
+        for selector, title in (("particles", "particle filter on SO(3)"), ("ukf", "UKF"))
+        for motion_deg in FILTER_MOTION_DEG
+        for candidate_deg in FILTER_CANDIDATE_DEG
+    ]
+
+
+def with_best_filters(selectors: Table, filters: Table) -> Table:
+    """The table of selectors with the one setting of each filter whose anchors are closest to the truth."""
+    best: dict[str, dict[str, Any]] = {}
+    for row in filters.rows:
+        kind = row["name"].split(",")[0]
+        if kind not in best or row["anchor_deg_mean"] < best[kind]["anchor_deg_mean"]:
+            best[kind] = row
+    return replace(selectors, rows=[*selectors.rows, *best.values()])
 
 
 def reference_rows(config: HatConfig) -> list[Row]:

@@ -202,6 +202,19 @@ def test_the_inertial_row_differs_from_the_one_above_by_the_prior_alone():
     assert row.settings(above.config)["settings"] == {"fusion.inertial_weight": CONFIG.fusion.relative_weight}
 
 
+def test_of_each_filter_the_best_setting_is_shown_and_all_are_told():
+    log = observations(flip_every=3, n=30)
+    rows = ablate.table_rows(CONFIG)
+    filters = ablate.table_of("f", rows["filters"], [log])
+    shown = ablate.with_best_filters(ablate.table_of("s", rows["selectors"], [log]), filters).rows[-2:]
+    for kind, row in zip(("particle filter on SO(3)", "UKF"), shown, strict=True):
+        errors = [line["anchor_deg_mean"] for line in filters.rows if line["name"].startswith(kind)]
+        assert len(errors) == 9
+        assert row["anchor_deg_mean"] == min(errors)
+    told = {str(row.settings(CONFIG)["noise"]) for row in rows["filters"]}
+    assert len(told) == 9
+
+
 def test_the_settings_of_a_row_make_its_configuration():
     for row in (row for rows in ablate.table_rows(CONFIG).values() for row in rows):
         data = config_to_dict(CONFIG)
