@@ -17,7 +17,7 @@ from types import TracebackType
 from typing import Any
 
 from hat_ros.config import HatConfig
-from hat_ros.errors import UsageError
+from hat_ros.errors import MissingDependencyError, UsageError
 from hat_ros.evaluation.tables import Column, Table
 from hat_ros.runner import GIVEN_MASK_BACKENDS, Watcher
 from hat_ros.source import Source
@@ -112,22 +112,21 @@ class Meter:
     Args:
         parts: what to measure; their modules are imported.
         wait: called before each reading of the clock, so that work handed to a device is done.
+
+    Raises:
+        MissingDependencyError: a part belongs to a package that is not installed.
     """
 
     def __init__(self, parts: Sequence[Part], wait: Callable[[], None]) -> None:
         self._parts, self._wait = parts, wait
         self._tallies = {part.name: Tally() for part in parts}
+        self._places = [_place(part) for part in parts]
         self._replaced: list[tuple[Any, str, Any]] = []
 
     def __enter__(self) -> Meter:
-        for part in self._parts:
-            module_name, path = part.where.split(":")
-            owner: Any = import_module(module_name)
-            *outer, name = path.split(".")
-            for attribute in outer:
-                owner = getattr(owner, attribute)
-            self._replaced.append((owner, name, owner.__dict__.get(name)))
-            setattr(owner, name, self._measured(part, getattr(owner, name), is_method=bool(outer)))
+        for part, (owner, name) in zip(self._parts, self._places, strict=True):
+            self._replaced.append((owner, name, vars(owner).get(name)))
+            setattr(owner, name, self._measured(part, getattr(owner, name), isinstance(owner, type)))
         return self
 
     def __exit__(
@@ -162,6 +161,26 @@ class Meter:
                 tally.seconds += time.perf_counter() - start
 
         return measured
+
+
+def _place(part: Part) -> tuple[Any, str]:
+    """The module or class that holds a part, and its name there."""
+    module_name, path = part.where.split(":")
+    owner: Any = _imported(module_name)
+    *outer, name = path.split(".")
+    for attribute in outer:
+        owner = getattr(owner, attribute)
+    return owner, name
+
+
+def _imported(module_name: str) -> Any:
+    try:
+        return import_module(module_name)
+    except ModuleNotFoundError as error:
+        raise MissingDependencyError(
+            f"profiling this configuration needs the package '{error.name}', which is not installed: "
+            f"run `make install-nets` (or `pip install 'hat_ros[nets]'`)"
+        ) from None
 
 
 def _rows(argument: Any) -> int:
@@ -245,6 +264,7 @@ def profile(source: Source, config: HatConfig, limit: int | None = None, watch: 
 
     Raises:
         UsageError: no frame was a keyframe, so there is nothing to say.
+        MissingDependencyError: a backend's package is not installed.
         InputError: bad input, as in a run.
     """
     wait, device, peak_mib = _device(config)
@@ -306,11 +326,8 @@ def _device(config: HatConfig) -> tuple[Callable[[], None], str, Callable[[], fl
     """How to wait for the device, its name, and how to ask for its peak memory; torch only where a network runs."""
     if not {config.segmentation.backend, config.slam.backend, config.hypotheses.backend} & PARTS.keys():
         return (lambda: None), "the CPU", lambda: float("nan")
-    import torch
-
-    from hat_ros.nets.runtime import choose_device
-
-    device = choose_device(config.nets.device)
+    torch = _imported("torch")
+    device = _imported("hat_ros.nets.runtime").choose_device(config.nets.device)
     if device.type == "cpu":
         return (lambda: None), f"the CPU, {torch.get_num_threads()} threads", lambda: float("nan")
     torch.cuda.reset_peak_memory_stats(device)

@@ -1,6 +1,7 @@
 """What is counted and timed: calls from outside, nothing left behind, and the passes and renders of MegaPose."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hat_ros.cli import main
 from hat_ros.config import load_config
 from hat_ros.datasets.suite import Clip, synthesize
 from hat_ros.datasets.synth import ClipSpec
-from hat_ros.errors import UsageError
+from hat_ros.errors import MissingDependencyError, UsageError
 from hat_ros.evaluation.profile import PARTS, Meter, Part, parts_of, profile
 from hat_ros.segmentation.stage import SegmentationStage
 from hat_ros.source import open_source
@@ -57,6 +58,18 @@ def test_calls_and_images_are_counted_and_everything_is_put_back():
     assert (tallies["function"].calls, tallies["function"].images) == (2, 4)
     assert tallies["function"].seconds > 0 and len(waits) == 6
     assert double is plain and "work" not in Derived.__dict__
+
+
+def test_a_missing_package_is_one_sentence_and_nothing_is_left_wrapped(monkeypatch):
+    before = SegmentationStage.update
+    monkeypatch.setitem(sys.modules, "torch", None)
+    parts = (
+        Part("stage", "hat_ros.segmentation.stage:SegmentationStage.update"),
+        Part("gone", "torch:nn.Module.forward"),
+    )
+    with pytest.raises(MissingDependencyError, match="'torch'.*make install-nets"), Meter(parts, lambda: None):
+        pass
+    assert SegmentationStage.update is before
 
 
 @pytest.mark.parametrize("backend", PARTS)
