@@ -110,6 +110,13 @@ def mask_moments(mask: NDArray[np.bool_]) -> tuple[NDArray[np.float64], float]:
     return np.array([m["m10"] / area + x0, m["m01"] / area + y0]), float(np.sqrt(spread))
 
 
+def image_moments(image: NDArray[np.float32]) -> tuple[NDArray[np.float64], float]:
+    """Centroid (2,) and radius of gyration of the light in an image that is not black, pixels."""
+    m = cv2.moments(image)
+    spread = (m["mu20"] + m["mu02"]) / m["m00"] + 1.0 / 6.0
+    return np.array([m["m10"], m["m01"]]) / m["m00"], float(np.sqrt(spread))
+
+
 def polar_grid(
     image: NDArray[np.float32],
     center_px: NDArray[np.float64],

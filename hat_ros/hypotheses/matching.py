@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from hat_ros import lie
-from hat_ros.hypotheses.bank import ViewBank, mask_moments, polar_grid, ring_weights
+from hat_ros.hypotheses.bank import ViewBank, image_moments, mask_moments, polar_grid, ring_weights
 from hat_ros.types import Camera
 
 # What silhouette without mask costs, against mask without silhouette = 1. A part that lies in shadow or outside the
@@ -98,14 +98,47 @@ def match_shape(
         center_m: (3,) centre of the target's box, which the bank's camera looks at.
     """
     score = _scores(bank, mask, placements)
-    n_placements, n_views, n_angles = score.shape
+    return _best_matches(bank, score, placements, camera, n_best, separation_deg, center_m)
+
+
+def match_light(
+    bank: ViewBank,
+    light: NDArray[np.float32],
+    camera: Camera,
+    n_best: int,
+    separation_deg: float,
+    center_m: NDArray[np.float64],
+) -> ShapeMatches:
+    """Correlation with a bank of brightness: the best distinct matches.
+
+    Args:
+        bank: the target's views, each spectrum of unit norm.
+        light: (H, W) float32, black but for the target, not all black.
+        camera, n_best, separation_deg, center_m: as for :func:`match_shape`.
+    """
+    placement = Placement(*image_moments(light))
+    grid = polar_grid(light, placement.center_px, placement.gyration_px, bank.n_angles)
+    norm = float(np.linalg.norm(grid))
+    score = _correlate(bank, grid[None] / np.float32(norm if norm > 0 else 1.0))
+    return _best_matches(bank, score, [placement], camera, n_best, separation_deg, center_m)
+
+
+def _best_matches(
+    bank: ViewBank,
+    score: NDArray[np.float32],
+    placements: list[Placement],
+    camera: Camera,
+    n_best: int,
+    separation_deg: float,
+    center_m: NDArray[np.float64],
+) -> ShapeMatches:
+    """The best of all scores (placements, views, angles) that are distinct."""
     flat = score.ravel()
     n_sorted = min(flat.size, 4096)
     order = np.argpartition(-flat, n_sorted - 1)[:n_sorted]
     order = order[np.lexsort((order, -flat[order]))]
     placement, view, angle = np.unravel_index(order, score.shape)
-    del n_placements, n_views
-    T = _poses(bank, placements, placement, view, angle * (2.0 * np.pi / n_angles), camera, center_m)
+    T = _poses(bank, placements, placement, view, angle * (2.0 * np.pi / bank.n_angles), camera, center_m)
     keep = distinct(T[:, :3, :3], n_best, np.radians(separation_deg))
     return ShapeMatches(T[keep], view[keep], flat[order][keep].astype(np.float64))
 

@@ -10,15 +10,25 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from hat_ros.refinement.refiner import Fit
-from hat_ros.refinement.view import MaskField, TargetViewer, View
+from hat_ros.refinement.view import VISIBLE_LEVEL, MaskField, TargetViewer, View
 from hat_ros.types import Frame
 
 # Outlines closer than this agree, pixels.
 _TOLERANCE_PX = 0.5
 # Mean distance of outlines at which a mismatch begins to saturate.
 _MISMATCH_PX = 0.3
+# Share of the mask's surroundings that is black before a black sky.
+_DARK_SHARE = 0.7
+# Independent samples in a reduced image: residuals err together over parts of the body.
+LIGHT_WEIGHT = 12.0
+# Light is looked for this far around the mask, above the sky's noise in grey levels; the least sum that tells anything.
+_HALO_PX = 9
+_SKY_NOISE = 2.0
+_MIN_LIGHT = 500.0
+_LIGHT_FLOOR = 0.02
 
 
 @dataclass(frozen=True)
@@ -53,6 +63,25 @@ class Scorer:
         self.field = field
         self._render_px = render_px
         self.luma = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+        self.dark_around = self._is_dark_around()
+
+    def _is_dark_around(self) -> bool:
+        """Whether the mask is surrounded by black, so that it can only hold what is lit."""
+        x0, y0 = np.maximum(self.field.origin_px, 0).astype(int)
+        height, width = self.field.distance.shape
+        x1, y1 = (self.field.origin_px + (width, height)).astype(int)
+        around = self.luma[y0:y1, x0:x1]
+        outside = ~self.field.mask[y0:y1, x0:x1]
+        dark = np.count_nonzero(outside & (around < VISIBLE_LEVEL))
+        return dark >= _DARK_SHARE * max(np.count_nonzero(outside), 1)
+
+    def light(self) -> NDArray[np.float32] | None:
+        """(H, W) what shines in and around the mask, without the sky's level; None when that is next to nothing."""
+        around = cv2.dilate(self.field.mask.astype(np.uint8), np.ones((_HALO_PX, _HALO_PX), np.uint8))
+        outside = self.luma[around == 0]
+        level = float(np.median(outside)) if outside.size else 0.0
+        light = np.maximum(self.luma.astype(np.float32) - np.float32(level + _SKY_NOISE), 0) * around
+        return light if light.sum() >= _MIN_LIGHT else None
 
     def mismatch(self, view: View, outline_px: float, tolerance_px: float) -> tuple[float, float, float]:
         """Excess, missing and hidden (see :class:`Evidence`) of what disagrees deeper than a tolerance."""
@@ -60,9 +89,9 @@ class Scorer:
         outline = max(outline_px, 1.0)
         return areas.extra / outline, areas.missing / outline, areas.hidden / outline
 
-    def evidence(self, fit: Fit) -> Evidence | None:
-        """Gather the evidence for a refined pose; None when it cannot be seen."""
-        view = self._viewer.view(fit.T_cam_target, self._frame.camera, self._render_px)
+    def evidence(self, fit: Fit, to_sun_cam: NDArray[np.float64] | None = None) -> Evidence | None:
+        """Gather the evidence for a refined pose, or for its part that a sun shines on; None when it cannot be seen."""
+        view = self._viewer.view(fit.T_cam_target, self._frame.camera, self._render_px, to_sun_cam)
         if view is None:
             return None
         length = fit.lines[:, 2] * (fit.contour[:, 0] > 0)
@@ -91,6 +120,14 @@ def shape_score(excess_px: float, missing_px: float, hidden_px: float) -> float:
         - 1.7 * np.log1p(missing_px / _MISMATCH_PX)
         - 1.5 * np.log1p(hidden_px / _MISMATCH_PX)
     )
+
+
+def light_score(distance: float) -> float:
+    """Log-likelihood of what is bright and dark, from :class:`hat_ros.refinement.sunlight.Sunlight`.
+
+    That of residuals with a Laplace distribution of unknown width, of as many independent samples as the weight says.
+    """
+    return float(-LIGHT_WEIGHT * np.log(max(distance, _LIGHT_FLOOR)))
 
 
 def log_score(e: Evidence) -> float:

@@ -1,31 +1,43 @@
-"""Training-free hypotheses: shape matching against a view bank, then compiled refinement and scoring of each basin.
+"""Training-free hypotheses: matching against banks of views, then compiled refinement and scoring of each basin.
 
 1. The mask's shape is compared with every view at every in-plane angle (``matching``); the best distinct orientations
    are kept.
 2. Each is pulled onto the mask's boundary with the sparse contour of its view, no rendering needed.
 3. Each is rendered, compared with the mask, and refined again with its own contour on mask and image edges.
-4. The evidence of each is turned into a log-likelihood (``scoring``).
+4. The evidence of each is turned into a log-likelihood (``scoring``): how well its outline and the mask's agree, and
+   how well it explains what is bright and what is dark (``refinement.sunlight``).
+
+Before a black sky the mask holds what is lit, which need not be the whole target. Unless the best candidate is where
+the track expects it, matches of brightness (``lit_bank``) then compete as well: of those only the sunlit part of the
+contour is compared with the mask.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
+from hat_ros import lie
 from hat_ros.config import HatConfig
 from hat_ros.errors import ConfigError
-from hat_ros.hypotheses.bank import load_or_build
+from hat_ros.hypotheses.bank import ViewBank, load_or_build
 from hat_ros.hypotheses.box import silhouette_in_box
+from hat_ros.hypotheses.lit_bank import load_or_build_lit
 from hat_ros.hypotheses.matching import (
     Placement,
+    ShapeMatches,
     cut_placements,
     distinct,
+    match_light,
     match_shape,
     partial_placements,
     whole_placement,
 )
-from hat_ros.hypotheses.scoring import Evidence, Scorer, log_score, shape_score
-from hat_ros.refinement.refiner import Fit, PoseFitter, Schedule
+from hat_ros.hypotheses.scoring import Scorer, light_score, log_score, shape_score
+from hat_ros.refinement.refiner import PoseFitter, Schedule
+from hat_ros.refinement.sunlight import SunMatcher
 from hat_ros.refinement.view import MaskField, TargetViewer
 from hat_ros.render import create_renderer
 from hat_ros.target import Target
@@ -40,8 +52,27 @@ _MIN_SCALE_PX = 1.5
 _SELECTION_TOLERANCE_PX = 1.0
 # Best shape score below which the mask is taken to be incomplete.
 _POOR_SCORE = -6.0
+# Score short of the best at which no sunlight helps.
+_LIGHT_MATTERS = 10.0
+# Candidates of different searches closer than this are the same.
+_SAME_DEG = 8.0
 _FIRST = Schedule((0, 0, 0, 0), (1, 1, 1, 1), (6, 4, 3, 2))
 _LAST = Schedule((0, 4, 3.5, 3), (1, 2, 1.5, 1.5), (3, 2, 1.5, 1.5))
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where refinement begins: (4, 4) pose, and the direction to the sun (3,) if the mask is only what is lit."""
+
+    T_cam_target: NDArray[np.float64]
+    to_sun_cam: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Aligned(Start):
+    """A start after the first refinement, with its shape score."""
+
+    score: float = -np.inf
 
 
 class TemplateHypotheses:
@@ -66,6 +97,8 @@ class TemplateHypotheses:
         self._target = target
         self._viewer = TargetViewer(target)
         self._fitter = PoseFitter(self._viewer, options.render_px, _CONTOUR_POINTS)
+        self._sun = SunMatcher(self._viewer)
+        self._lit_bank = load_or_build_lit(self._viewer, options.n_angles)
         self._bank = load_or_build(target, create_renderer("embree", target), options.n_views, options.n_angles)
 
     def generate(self, frame: Frame, detection: Detection, prior: PosePrior | None) -> Candidates:
@@ -77,24 +110,29 @@ class TemplateHypotheses:
         scorer = Scorer(self._viewer, frame, field, self._options.render_px)
         starts = []
         if prior is not None and prior.healthy:
-            starts.append(self._fitter.centred(prior.T_cam_target, frame.camera, field, scorer.luma))
-        poses, scores = self._align(starts + self._coarse(whole_placement(mask), frame, field), frame, scorer)
-        if not poses or max(scores) < _POOR_SCORE:
+            starts.append(Start(self._fitter.centred(prior.T_cam_target, frame.camera, field, scorer.luma)))
+        aligned = self._align(starts + self._coarse(whole_placement(mask), frame, field), frame, scorer)
+        if not aligned or max(a.score for a in aligned) < _POOR_SCORE:
             # The mask is not the whole silhouette: look for those that it may be a part of.
             cut = detection.touches_border()
             placements = cut_placements(mask) if cut else partial_placements(mask)
-            more_poses, more_scores = self._align(self._coarse(placements, frame, field), frame, scorer)
-            poses, scores = poses + more_poses, scores + more_scores
-        fits = self._finish(self._select(poses, scores), frame, scorer)
-        if not fits:
+            aligned += self._align(self._coarse(placements, frame, field), frame, scorer)
+        scored = self._finish(self._select(aligned), frame, scorer)
+        if scorer.dark_around and not self._confirmed(prior, scored):
+            # What lies in shadow is missing from the mask: compare what is bright.
+            lit = self._align(self._coarse_lit(frame, scorer), frame, scorer)
+            scored += self._finish(lit, frame, scorer)
+        if not scored:
             return Candidates.none()
-        T = np.stack([fit.T_cam_target for fit, _ in fits])
-        return Candidates.from_matrices(T, np.array([log_score(e) for _, e in fits]), detection.box_xyxy)
+        scored.sort(key=lambda pair: -pair[1])
+        T, score = np.stack([T for T, _ in scored]), np.array([score for _, score in scored])
+        keep = distinct(T[:, :3, :3], self._max_candidates, np.radians(_SAME_DEG))
+        return Candidates.from_matrices(T[keep], score[keep], detection.box_xyxy)
 
     def reset(self) -> None:
         """Nothing to forget: every keyframe stands for itself."""
 
-    def _coarse(self, placements: list[Placement], frame: Frame, field: MaskField) -> list[NDArray[np.float64]]:
+    def _coarse(self, placements: list[Placement], frame: Frame, field: MaskField) -> list[Start]:
         """Shape matches, pulled onto the mask's boundary."""
         options = self._options
         matches = match_shape(
@@ -106,42 +144,85 @@ class TemplateHypotheses:
             options.separation_deg,
             self._target.center_m,
         )
-        scales = np.maximum(np.array(_COARSE_SCALES) * field.size_px, _MIN_SCALE_PX)
-        lines = np.zeros((self._bank.contour_m.shape[1], 5))
-        poses = []
-        for T, view in zip(matches.T_cam_target, matches.view, strict=True):
-            used = self._bank.contour_weight[view] > 0
-            lines[:, 2] = self._bank.contour_weight[view]
-            poses.append(self._fitter.pull(T, self._bank.contour_m[view][used], lines[used], frame, field, scales))
-        return poses
+        return [Start(T) for T in self._pulled(self._bank, matches, frame, field)]
 
-    def _align(
-        self, starts: list[NDArray[np.float64]], frame: Frame, scorer: Scorer
-    ) -> tuple[list[NDArray[np.float64]], list[float]]:
-        """Refine on the mask with rendered contours: poses and their shape scores."""
-        poses, scores = [], []
-        for T in starts:
-            view = self._viewer.view(T, frame.camera, self._options.render_px)
+    def _coarse_lit(self, frame: Frame, scorer: Scorer) -> list[Start]:
+        """Matches of brightness, the best explained by sunlight first."""
+        bank, options = self._lit_bank, self._options
+        light = scorer.light()
+        if light is None:
+            return []
+        matches = match_light(
+            bank, light, frame.camera, options.n_coarse_lit, options.separation_deg, self._target.center_m
+        )
+        found = []
+        for T in matches.T_cam_target:
+            sunlight = self._sun.match(T, frame, scorer.field.mask)
+            if sunlight is not None:
+                found.append((sunlight.distance, Start(T, sunlight.to_sun_cam)))
+        found.sort(key=lambda pair: pair[0])
+        return [start for _, start in found[: options.n_refined_lit]]
+
+    def _pulled(
+        self, bank: ViewBank, matches: ShapeMatches, frame: Frame, field: MaskField
+    ) -> list[NDArray[np.float64]]:
+        """Matches pulled onto the mask's boundary with the contour of their views."""
+        scales = np.maximum(np.array(_COARSE_SCALES) * field.size_px, _MIN_SCALE_PX)
+        lines = np.zeros((bank.contour_m.shape[1], 5))
+        out = []
+        for T, view in zip(matches.T_cam_target, matches.view, strict=True):
+            used = bank.contour_weight[view] > 0
+            lines[:, 2] = bank.contour_weight[view]
+            out.append(self._fitter.pull(T, bank.contour_m[view][used], lines[used], frame, field, scales))
+        return out
+
+    def _align(self, starts: list[Start], frame: Frame, scorer: Scorer) -> list[Aligned]:
+        """Refine on the mask with rendered contours, and compare shapes."""
+        out = []
+        for start in starts:
+            view = self._viewer.view(start.T_cam_target, frame.camera, self._options.render_px, start.to_sun_cam)
             if view is None:
                 continue
-            fit = self._fitter.iterate(T, view, frame.camera, frame.rgb, scorer.field, _FIRST)
-            poses.append(fit.T_cam_target)
-            scores.append(shape_score(*scorer.mismatch(view, fit.outline_px, _SELECTION_TOLERANCE_PX)))
-        return poses, scores
-
-    def _select(self, poses: list[NDArray[np.float64]], scores: list[float]) -> list[NDArray[np.float64]]:
-        """The K poses of best shape that are distinct basins, best first."""
-        if not poses:
-            return []
-        T = np.stack(poses)[np.argsort(-np.array(scores), kind="stable")]
-        return list(T[distinct(T[:, :3, :3], self._max_candidates, np.radians(self._options.separation_deg))])
-
-    def _finish(self, poses: list[NDArray[np.float64]], frame: Frame, scorer: Scorer) -> list[tuple[Fit, Evidence]]:
-        """Refine on mask and image, and gather the evidence."""
-        out = []
-        for T in poses:
-            fit = self._fitter.fit(T, frame.camera, frame.rgb, scorer.field, (_LAST,))
-            evidence = None if fit is None else scorer.evidence(fit)
-            if fit is not None and evidence is not None:
-                out.append((fit, evidence))
+            fit = self._fitter.iterate(start.T_cam_target, view, frame.camera, frame.rgb, scorer.field, _FIRST)
+            score = shape_score(*scorer.mismatch(view, fit.outline_px, _SELECTION_TOLERANCE_PX))
+            out.append(Aligned(fit.T_cam_target, start.to_sun_cam, score))
         return out
+
+    def _select(self, aligned: list[Aligned]) -> list[Aligned]:
+        """The K of best shape that are distinct basins, best first."""
+        if not aligned:
+            return []
+        ordered = sorted(aligned, key=lambda a: -a.score)
+        R = np.stack([a.T_cam_target[:3, :3] for a in ordered])
+        return [ordered[i] for i in distinct(R, self._max_candidates, np.radians(self._options.separation_deg))]
+
+    def _confirmed(self, prior: PosePrior | None, scored: list[tuple[NDArray[np.float64], float]]) -> bool:
+        """Whether the best candidate is the healthy prior's: then nothing else is looked for."""
+        if prior is None or not prior.healthy or not scored:
+            return False
+        best = max(scored, key=lambda pair: pair[1])[0]
+        apart_rad = lie.angle_between(best[:3, :3], prior.T_cam_target[:3, :3])
+        return bool(apart_rad < np.radians(self._options.separation_deg))
+
+    def _finish(self, starts: list[Aligned], frame: Frame, scorer: Scorer) -> list[tuple[NDArray[np.float64], float]]:
+        """Refine on mask and image, and score: poses and log-likelihoods.
+
+        Sunlight is fitted to those that it could still make the best; the others are given the worst of these fits.
+        """
+        poses, scores = [], []
+        for start in starts:
+            fit = self._fitter.fit(
+                start.T_cam_target, frame.camera, frame.rgb, scorer.field, (_LAST,), to_sun_cam=start.to_sun_cam
+            )
+            evidence = None if fit is None else scorer.evidence(fit, start.to_sun_cam)
+            if fit is not None and evidence is not None:
+                poses.append(fit.T_cam_target)
+                scores.append(log_score(evidence))
+        light = np.full(len(poses), np.nan)
+        for i, T in enumerate(poses):
+            if scores[i] > max(scores) - _LIGHT_MATTERS:
+                sunlight = self._sun.match(T, frame, scorer.field.mask)
+                light[i] = light_score(1.0 if sunlight is None else sunlight.distance)
+        worst = np.nanmin(light) if len(poses) else 0.0
+        light = np.nan_to_num(light, nan=worst)
+        return [(T, score + float(extra)) for T, score, extra in zip(poses, scores, light, strict=True)]

@@ -10,12 +10,15 @@ from hat_ros import lie
 from hat_ros.config import RefinementConfig
 from hat_ros.refinement.covariance import outline_floor, pose_covariance
 from hat_ros.refinement.refiner import WITH_MASK, WITHOUT_MASK, PoseFitter
-from hat_ros.refinement.view import MaskField, TargetViewer
+from hat_ros.refinement.sunlight import SunMatcher
+from hat_ros.refinement.view import MaskField, Overlap, TargetViewer
 from hat_ros.target import Target
 from hat_ros.types import Detection, Frame, Refined
 
 # The mask's robust scales are meant for a target of this size or more and shrink with smaller ones.
 _USUAL_SIZE_PX = 250.0
+# Share of a silhouette that is black on black from which the sun is looked for.
+_SHADOW_SHARE = 0.15
 _SCALE_LIMITS = (0.4, 1.0)
 
 
@@ -31,6 +34,7 @@ class FusedPoseRefiner:
         self._config = config
         self._target = target
         self._viewer = TargetViewer(target)
+        self._sun = SunMatcher(self._viewer)
         self._fitter = PoseFitter(self._viewer, config.render_px, config.max_points)
 
     def refine(self, frame: Frame, detection: Detection | None, T_cam_target: NDArray[np.float64]) -> Refined | None:
@@ -54,6 +58,11 @@ class FusedPoseRefiner:
             start = self._fitter.centred(T_cam_target, frame.camera, field, luma)
         sigma = np.radians(self._config.start_sigma_deg)
         fit = self._fitter.fit(start, frame.camera, frame.rgb, field, rounds, sigma)
+        if fit is not None and field is not None and _lies_in_shadow(field.compare(fit.view, luma)):
+            # Part of the silhouette cannot be seen: find out which, and fit what can.
+            sunlight = self._sun.match(start, frame, field.mask)
+            if sunlight is not None:
+                fit = self._fitter.fit(start, frame.camera, frame.rgb, field, rounds, sigma, sunlight.to_sun_cam) or fit
         if fit is None or not self._same_basin(start, fit.T_cam_target):
             return None
         covariance = pose_covariance(fit, self._target.bounding_radius_m)
@@ -77,3 +86,8 @@ class FusedPoseRefiner:
         center_after = T_after[:3, :3] @ self._target.center_m + T_after[:3, 3]
         shift = np.linalg.norm(center_after - center_before) / np.linalg.norm(center_before)
         return bool(turn <= self._config.max_rotation_deg and shift <= self._config.max_shift)
+
+
+def _lies_in_shadow(areas: Overlap) -> bool:
+    """Whether much of a silhouette is missing from the mask before black."""
+    return areas.hidden > _SHADOW_SHARE * (areas.common + areas.hidden + areas.missing)

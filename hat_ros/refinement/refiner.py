@@ -106,12 +106,16 @@ class PoseFitter:
         field: MaskField | None,
         rounds: tuple[Schedule, ...],
         prior_sigma_rad: float = np.inf,
+        to_sun_cam: NDArray[np.float64] | None = None,
     ) -> Fit | None:
-        """Refine a pose whose rotation is known to a sigma; None when the target leaves the view on the way."""
+        """Refine a pose whose rotation is known to a sigma; None when the target leaves the view on the way.
+
+        With a direction to the sun the contour is that of the sunlit part.
+        """
         T = T_cam_target
         fit = None
         for schedule in rounds:
-            view = self.viewer.view(T, camera, self._render_px)
+            view = self.viewer.view(T, camera, self._render_px, to_sun_cam)
             if view is None:
                 return None
             fit = self.iterate(T, view, camera, image, field, schedule, prior_sigma_rad)

@@ -16,10 +16,12 @@ from hat_ros.refinement.contour import (
     COL_NU,
     COL_NV,
     COL_OUTSIDE,
+    COL_U,
+    COL_V,
     COL_WEIGHT,
     contour_table,
 )
-from hat_ros.refinement.outline import grid_rays, pixel_rays, place_pixels, spread_grid
+from hat_ros.refinement.outline import Rays, grid_rays, pixel_rays, place_pixels, spread_grid
 from hat_ros.render.embree import RayCaster
 from hat_ros.target import Target
 from hat_ros.types import Camera
@@ -30,6 +32,9 @@ VISIBLE_LEVEL = 32.0
 _CROP_MARGIN_PX = 4
 # What lies further outside the image than this share of its longer side is not rendered.
 _BEYOND_IMAGE = 0.05
+# Shadow rays start this far off the surface, in bounding radii; light this close to grazing shows nothing.
+_SHADOW_START = 2e-3
+_GRAZING = 0.02
 # The field reaches this far around the mask, pixels and share of the mask's longer side.
 _MIN_MARGIN_PX = 20
 _MARGIN_SHARE = 0.15
@@ -48,6 +53,7 @@ class View:
         camera: intrinsics of the crop.
         origin_px: (2,) image position of the crop's pixel (0, 0).
         scale: crop pixels per image pixel.
+        lit: (h, w) bool part of the silhouette that the sun shines on; None when no sun is known.
     """
 
     mask: NDArray[np.bool_]
@@ -55,6 +61,28 @@ class View:
     camera: Camera
     origin_px: NDArray[np.float64]
     scale: float
+    lit: NDArray[np.bool_] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Surfels:
+    """Points of the surface that rays see, in the target frame.
+
+    Attributes:
+        pixel: (M,) index of the ray that sees each.
+        face_id: (M,) face.
+        points_m: (M, 3) position.
+        directions: (M, 3) of the ray.
+        normals: (M, 3) unit, towards the camera.
+        rgb: (M, 3) uint8 albedo, sRGB.
+    """
+
+    pixel: NDArray[np.intp]
+    face_id: NDArray[np.int32]
+    points_m: NDArray[np.float32]
+    directions: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    rgb: NDArray[np.uint8]
 
 
 class TargetViewer:
@@ -63,21 +91,32 @@ class TargetViewer:
     def __init__(self, target: Target) -> None:
         self.target = target
         self._caster = RayCaster(target)
+        corners = target.vertices_m[target.faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        self._normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
+        self._shadow_start_m = np.float32(_SHADOW_START * target.bounding_radius_m)
         try:
             self._hull_m = target.vertices_m[ConvexHull(target.vertices_m).vertices]
         except QhullError:  # a flat model
             self._hull_m = target.vertices_m
 
-    def view(self, T_cam_target: NDArray[np.float64], camera: Camera, side_px: int) -> View | None:
-        """The target at a pose, longer side ``side_px`` crop pixels; None when out of view or behind the camera."""
-        points = self._hull_m @ T_cam_target[:3, :3].T + T_cam_target[:3, 3]
-        if not np.isfinite(points).all() or points[:, 2].min() <= 1e-3 * self.target.bounding_radius_m:
+    def view(
+        self,
+        T_cam_target: NDArray[np.float64],
+        camera: Camera,
+        side_px: int,
+        to_sun_cam: NDArray[np.float64] | None = None,
+    ) -> View | None:
+        """The target at a pose, longer side ``side_px`` crop pixels; None when out of view or behind the camera.
+
+        With a direction to the sun, (3,) in the camera frame, the view also tells what the sun shines on.
+        """
+        bounds = self.bounds(T_cam_target, camera)
+        if bounds is None:
             return None
-        uv = camera.project(points)
         size = np.array([camera.width, camera.height])
         beyond = _BEYOND_IMAGE * size.max()
-        low = np.clip(uv.min(axis=0), -beyond, size + beyond)
-        high = np.clip(uv.max(axis=0), -beyond, size + beyond)
+        low, high = np.clip(bounds[:2], -beyond, size + beyond), np.clip(bounds[2:], -beyond, size + beyond)
         scale = (side_px - 2 * _CROP_MARGIN_PX) / max(float((high - low).max()), 1e-3)
         if not 1e-3 < scale < 1e3:
             return None
@@ -87,20 +126,89 @@ class TargetViewer:
         K[:2, 2] -= origin
         K[:2] *= scale
         crop = Camera(K, int(width + width % 2), int(height + height % 2))
-        mask, depth = self._cast(T_cam_target, crop)
-        return View(mask, depth, crop, origin, scale)
+        mask, depth, lit = self._cast(T_cam_target, crop, to_sun_cam)
+        return View(mask, depth, crop, origin, scale, lit)
 
-    def _cast(self, T_cam_target: NDArray[np.float64], crop: Camera) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
-        """Silhouette and depth near its outline, both (h, w)."""
+    def bounds(self, T_cam_target: NDArray[np.float64], camera: Camera) -> NDArray[np.float64] | None:
+        """Image box (x0, y0, x1, y1) around the target, None when it is not in front of the camera."""
+        points = self._hull_m @ T_cam_target[:3, :3].T + T_cam_target[:3, 3]
+        if not np.isfinite(points).all() or points[:, 2].min() <= 1e-3 * self.target.bounding_radius_m:
+            return None
+        uv = camera.project(points)
+        return np.concatenate([uv.min(axis=0), uv.max(axis=0)])
+
+    def surface(self, directions: NDArray[np.float64], origin_m: NDArray[np.float64]) -> Surfels:
+        """What rays (N, 3) from one point see, in the target frame."""
+        directions = directions.astype(np.float32)
+        origins = np.empty_like(directions)
+        origins[:] = origin_m
+        hits = self._caster.trace(origins, directions)
+        at = np.flatnonzero(hits["primID"] >= 0)
+        face_id, u, v = hits["primID"][at], hits["u"][at], hits["v"][at]
+        directions = directions[at]
+        normals = self._normals[face_id]
+        normals[np.einsum("nk,nk->n", normals, directions) > 0] *= np.float32(-1)
+        rgb = self.target.surface.sample(face_id, np.stack([1.0 - u - v, u, v], axis=-1), self.target.face_rgb)
+        return Surfels(at, face_id, origins[at] + directions * hits["tfar"][at, None], directions, normals, rgb)
+
+    def _cast(
+        self, T_cam_target: NDArray[np.float64], crop: Camera, to_sun_cam: NDArray[np.float64] | None
+    ) -> tuple[NDArray[np.bool_], NDArray[np.float32], NDArray[np.bool_] | None]:
+        """Silhouette, depth near its outline, and what of it is sunlit if there is a sun, all (h, w)."""
         R, t = T_cam_target[:3, :3], T_cam_target[:3, 3]
         to_ray = np.ascontiguousarray((R.T @ np.linalg.inv(crop.K)).T)  # rays in the target frame: affine in the pixel
         origin = -t @ R
-        hits = self._caster.trace(*grid_rays(crop.width, crop.height, to_ray, origin))
+        to_sun = None if to_sun_cam is None else (to_sun_cam / np.linalg.norm(to_sun_cam) @ R).astype(np.float32)
+        rays = grid_rays(crop.width, crop.height, to_ray, origin)
+        hits = self._caster.trace(*rays)
         mask, depth, x, y = spread_grid(hits["primID"], hits["tfar"], crop.width, crop.height)
+        lit = None
+        if to_sun is not None:
+            sunlit = self._sunlit_hits(hits, rays, to_sun).reshape(crop.height // 2, crop.width // 2)
+            lit = np.repeat(np.repeat(sunlit, 2, axis=0), 2, axis=1)
         if len(x):
-            hits = self._caster.trace(*pixel_rays(x, y, to_ray, origin))
+            rays = pixel_rays(x, y, to_ray, origin)
+            hits = self._caster.trace(*rays)
             place_pixels(mask, depth, x, y, hits["primID"], hits["tfar"])
-        return mask, depth
+            if lit is not None:
+                lit[y, x] = self._sunlit_hits(hits, rays, to_sun)
+        return mask, depth, lit
+
+    def _sunlit_hits(self, hits: dict[str, NDArray], rays: Rays, to_sun: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Which of the rays (N,) hit something that the sun shines on."""
+        at = np.flatnonzero(hits["primID"] >= 0)
+        origins, directions = rays
+        points = origins[at] + directions[at] * hits["tfar"][at, None]
+        lit = np.zeros(len(directions), np.bool_)
+        lit[at] = self.sunlit(points, hits["primID"][at], directions[at], to_sun) > 0
+        return lit
+
+    def sunlit(
+        self,
+        points_m: NDArray[np.float32],
+        face_id: NDArray[np.int32],
+        directions: NDArray[np.float32],
+        to_sun: NDArray[np.float32],
+    ) -> NDArray[np.float32]:
+        """Cosine of the sun's incidence (N,) at points that the camera sees, 0 where the sun does not reach.
+
+        Args:
+            points_m: (N, 3) on the surface.
+            face_id: (N,) faces they lie on.
+            directions: (N, 3) from the camera to them, any length.
+            to_sun: (3,) unit; everything in the target frame.
+        """
+        normals = self._normals[face_id]
+        cosine = normals @ to_sun
+        # The side that faces the camera is lit, however the file winds its faces.
+        seen = np.where(np.einsum("nk,nk->n", normals, directions) > 0, np.float32(-1), np.float32(1))
+        cosine *= seen
+        lit = np.flatnonzero(cosine > _GRAZING)
+        start = points_m[lit] + (seen[lit, None] * self._shadow_start_m) * normals[lit]
+        lit = lit[~self._caster.occluded(start, np.broadcast_to(to_sun, start.shape))]
+        out = np.zeros(len(points_m), np.float32)
+        out[lit] = cosine[lit]
+        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +226,11 @@ class ContourLines:
 
 
 def contour_lines(view: View, T_cam_target: NDArray[np.float64], max_points: int) -> ContourLines:
-    """Sample the contour of a view."""
+    """Sample the contour of a view; where a sun is known, only what it shines on, since the rest cannot be seen."""
     table = contour_table(view.depth_m, view.mask, view.camera.K, max_points)
+    if view.lit is not None:
+        inner = np.rint(table[:, [COL_V, COL_U]] - table[:, [COL_NV, COL_NU]]).astype(np.intp)
+        table = table[view.lit[inner[:, 0], inner[:, 1]]]
     points = (table[:, :3] - T_cam_target[:3, 3]) @ T_cam_target[:3, :3]
     lines = table[:, [COL_NU, COL_NV, COL_WEIGHT, COL_INSIDE, COL_OUTSIDE]]
     lines[:, 2:] /= view.scale
@@ -180,9 +291,10 @@ class MaskField:
         depth, band = (0.0, 1e-3) if tolerance_px is None else (tolerance_px, 1.0)
         total = self.area_px if tolerance_px is None else self._area_deeper_than(tolerance_px)
         offset = view.origin_px - self.origin_px
-        common, missing, hidden = silhouette_areas(
-            view.mask, self.distance, offset, luma, view.origin_px, 1.0 / view.scale, depth, band
-        )
+        where = (self.distance, offset, luma, view.origin_px, 1.0 / view.scale, depth, band)
+        common, missing, hidden = silhouette_areas(view.mask, *where)
+        if view.lit is not None:  # nothing is missed in the shadow
+            _, missing, hidden = silhouette_areas(view.lit, *where)
         return Overlap(common, max(total - common, 0.0), missing, hidden)
 
     def _area_deeper_than(self, depth_px: float) -> float:

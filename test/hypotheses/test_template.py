@@ -1,14 +1,14 @@
 import cv2
 import numpy as np
 import pytest
-from shape_scene import CAMERA, picture, pose_errors, random_pose, spacecraft
+from shape_scene import CAMERA, picture, pose_errors, random_pose, spacecraft, sunlit_picture
 
 from hat_ros import lie
 from hat_ros.config import HatConfig, HypothesesConfig, TemplateConfig
 from hat_ros.errors import ConfigError
 from hat_ros.hypotheses.stage import HypothesisStage
 from hat_ros.hypotheses.template import TemplateHypotheses
-from hat_ros.types import Detection, Frame, PosePrior
+from hat_ros.types import Camera, Detection, Frame, PosePrior
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +33,29 @@ def test_a_rendered_view_is_found_again_from_any_angle(backend, target, seed):
     assert turn[0] < 1.5
     assert shift[0] < 0.01
     assert (np.diff(candidates.log_score) <= 0).all()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_view_with_half_its_silhouette_in_shadow_is_found_again(backend, target, seed):
+    T_true = random_pose(np.random.default_rng(seed), target)
+    frame, mask = sunlit_picture(target, T_true, (-1.0, 0.4, -0.1))
+    lit = mask & (frame.rgb.max(axis=2) > 16)
+    assert np.count_nonzero(lit) < 0.8 * np.count_nonzero(mask)
+    candidates = backend.generate(frame, Detection(lit), None)
+    turn, shift = pose_errors(candidates.T_cam_target, T_true)
+    assert turn[0] < 8
+    assert shift[0] < 0.05
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_light_tells_orientations_of_one_silhouette_apart(backend, target, seed):
+    """Seen from opposite sides a distant body has mirrored outlines, and all but symmetric ones are alike."""
+    T_true = random_pose(np.random.default_rng(seed), target, range_m=(20.0, 24.0))
+    camera = Camera(CAMERA.K * np.array([[3.0, 1, 1], [1, 3.0, 1], [1, 1, 1]]), CAMERA.width, CAMERA.height)
+    T_true[:2, 3] = 0.0
+    frame, mask = sunlit_picture(target, T_true, (0.3, -0.4, -1.0), camera=camera)
+    turn, _ = pose_errors(backend.generate(frame, Detection(mask), None).T_cam_target, T_true)
+    assert turn[0] < 8
 
 
 def test_candidates_are_distinct_basins(backend, target):

@@ -6,7 +6,8 @@ import trimesh
 
 from hat_ros import lie
 from hat_ros.render import create_renderer
-from hat_ros.target import target_from_scene
+from hat_ros.render.sunlit import Light, SunlitRenderer
+from hat_ros.target import srgb_from_linear, target_from_scene
 from hat_ros.types import Camera, Frame
 
 CAMERA = Camera(np.array([[500.0, 0, 159.5], [0, 500.0, 119.5], [0, 0, 1]]), 320, 240)
@@ -61,3 +62,13 @@ def pose_errors(T_cam_target, T_true):
     """Rotation error in degrees, position error as a share of the range."""
     turn = np.degrees(lie.angle_between(T_cam_target[..., :3, :3], T_true[:3, :3]))
     return turn, np.linalg.norm(T_cam_target[..., :3, 3] - T_true[:3, 3], axis=-1) / np.linalg.norm(T_true[:3, 3])
+
+
+def sunlit_picture(target, T_cam_target, to_sun_cam, exposure=0.8, camera=CAMERA):
+    """A frame in hard sunlight before a black sky, and the true mask: what is in shadow is all but black."""
+    light = Light(np.asarray(to_sun_cam, dtype=np.float64), ambient=0.002)
+    renderer = SunlitRenderer(target)
+    radiance, _ = renderer.render(T_cam_target, camera, light)
+    rgb = np.rint(srgb_from_linear(np.clip(radiance * exposure, 0, 1))).astype(np.uint8)
+    mask = renderer.plain.render(T_cam_target, camera, color=False).mask
+    return Frame(1, rgb, camera), mask
