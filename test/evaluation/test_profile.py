@@ -67,7 +67,7 @@ def test_a_missing_package_is_one_sentence_and_nothing_is_left_wrapped(monkeypat
         Part("stage", "hat_ros.segmentation.stage:SegmentationStage.update"),
         Part("gone", "torch:nn.Module.forward"),
     )
-    with pytest.raises(MissingDependencyError, match="'torch'.*make install-nets"), Meter(parts, lambda: None):
+    with pytest.raises(MissingDependencyError, match=r"'torch'.*make install-nets"), Meter(parts, lambda: None):
         pass
     assert SegmentationStage.update is before
 
