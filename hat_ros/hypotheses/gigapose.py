@@ -55,8 +55,8 @@ class GigaPoseHypotheses:
         LOG.info("rendering %d templates, once per CAD model", len(poses))
         crops, masks, Ms = [], [], []
         for T in poses:
-            rgb = renderer.render(T, TEMPLATE_K, TEMPLATE_SIZE)[..., :3]
-            mask = rgb.any(axis=2)
+            view = renderer.render(T, TEMPLATE_K, TEMPLATE_SIZE)
+            rgb, mask = view[..., :3], view.any(axis=2)  # a black surface still has a normal
             M = letterbox(mask)
             crops.append(cut(rgb, M))
             masks.append(cut(mask.astype(np.uint8), M))
