@@ -7,6 +7,8 @@ a file of poses, and from then on they are a run like any other: a result folder
 * BOP: a ``.csv`` with ``scene_id,im_id,obj_id,score,R,t,time``, R 9 and t 3 numbers separated by blanks, t in
   millimetres; the best score of an image counts. An image's number is its frame number, and its ``time`` in seconds
   makes the frame rate, unless it is -1.
+* A folder of ``NUMBER.txt`` with a 4 x 4 matrix each, metres, NUMBER the frame's (the ``ob_in_cam`` folder that
+  FoundationPose leaves, from which RGBTrack derives).
 
 Poses map target (the CAD file's own axes) to camera (OpenCV), as everywhere here.
 """
@@ -76,20 +78,20 @@ class ScoreOptions:
 
 
 def read_poses(path: Path, scene: tuple[int, int] | None = None) -> ExternalPoses:
-    """Read a TUM or BOP file.
+    """Read a TUM or BOP file, or a folder of matrices.
 
     Args:
-        path: ``.csv`` is BOP, anything else TUM.
+        path: ``.csv`` is BOP, a folder holds matrices, anything else is TUM.
         scene: (scene, object) whose rows of a BOP file count; None = the file has one only.
 
     Raises:
         InputError: missing, malformed, no pose in it, or several scenes or objects without ``scene``.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"poses {path}: cannot be read ({getattr(error, 'strerror', None) or 'not text'})") from None
-    poses = _read_bop(path, text, scene) if path.suffix == ".csv" else _read_tum(path, text)
+    if path.is_dir():
+        poses = _read_matrices(path)
+    else:
+        text = _read_text(path)
+        poses = _read_bop(path, text, scene) if path.suffix == ".csv" else _read_tum(path, text)
     if not poses.rows:
         raise InputError(f"poses {path}: holds no pose" + (f" of scene, object {scene}" if scene else ""))
     return poses
@@ -174,6 +176,25 @@ def _write_bag(path: Path, source: Source, stamps: list[int], rows: dict[int, ND
 
 def _rate(seconds: NDArray[np.float64]) -> float:
     return float(1.0 / seconds.mean()) if len(seconds) and seconds.mean() > 0 else float("nan")
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"poses {path}: cannot be read ({getattr(error, 'strerror', None) or 'not text'})") from None
+
+
+def _read_matrices(folder: Path) -> ExternalPoses:
+    rows = {}
+    for path in sorted(folder.glob("*.txt")):
+        if not path.stem.isdigit():
+            raise InputError(f"poses {path}: the name must be the frame's number, like 000012.txt")
+        T = _numbers(_read_text(path).split(), f"poses {path}", 16).reshape(4, 4)
+        if not lie.is_rigid(T, 1e-3):
+            raise InputError(f"poses {path}: the matrix is no rigid transform")
+        rows[stamp_of(int(path.stem))] = lie.row_from_matrix(T)
+    return ExternalPoses(rows, np.zeros(0))
 
 
 def _read_tum(path: Path, text: str) -> ExternalPoses:

@@ -119,6 +119,25 @@ def test_of_a_bop_file_with_several_objects_only_the_recordings_counts(tmp_path)
         read_poses(path, scene=(9, 9))
 
 
+def test_a_folder_of_matrices_is_read_by_frame_number(bag, tmp_path):
+    poses = tmp_path / "ob_in_cam"
+    poses.mkdir()
+    for i in range(N):
+        np.savetxt(poses / f"{i:06d}.txt", lie.matrix_from_row(true_row(i)))
+    rows = read_poses(poses).rows
+    assert sorted(rows) == [stamp_of(i) for i in range(N)]
+    np.testing.assert_allclose(rows[stamp_of(2)], true_row(2), atol=1e-12)
+    np.savetxt(poses / "000003.txt", 2 * np.eye(4))
+    with pytest.raises(InputError, match=r"000003.txt: the matrix is no rigid"):
+        read_poses(poses)
+    np.savetxt(poses / "000003.txt", np.eye(3))
+    with pytest.raises(InputError, match="expected 16 finite numbers"):
+        read_poses(poses)
+    (poses / "000003.txt").rename(poses / "frame3.txt")
+    with pytest.raises(InputError, match="must be the frame's number"):
+        read_poses(poses)
+
+
 @pytest.mark.parametrize(
     ("name", "text", "complaint"),
     [

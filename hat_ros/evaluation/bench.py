@@ -152,7 +152,7 @@ def bench_jobs(
                 name, poses = f"{spec.name}-{method}-{start}", Path(pattern.replace("{clip}", spec.name)).resolve()
                 if method in modes:
                     raise UsageError(f"--poses {method}: a method of that name runs already, choose another name")
-                if not poses.is_file():
+                if not poses.exists():
                     raise UsageError(f"--poses {method}: {poses} does not exist; use {{clip}} for the clip's name")
                 labels = {"group": spec.group, "clip": spec.name, "masks": "-", "start": str(start), "mode": method}
                 jobs[name] = Job(name, spec, method, config, (), start, limit, labels, poses)
