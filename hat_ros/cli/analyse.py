@@ -70,10 +70,11 @@ def _add_score(commands: Commands) -> None:
     parser = commands.add_parser(
         "score",
         help="poses of a method that is not ours, as a run like any other",
-        description="Score a file of poses that another tracker (RGBTrack, FoundationPose, your own) made of a "
-        "recording, and write a result folder. FILE is TUM (stamp in seconds, x y z qx qy qz qw) or, ending in .csv, "
-        "BOP (scene_id,im_id,obj_id,score,R,t,time), or a folder of NUMBER.txt with a 4 x 4 matrix each. Poses map the CAD file's own axes to the OpenCV camera, in "
-        "metres (BOP: millimetres). `hat bench --poses NAME=FILE` puts it into the table beside the others.",
+        description="Score the poses that another tracker (RGBTrack, FoundationPose, your own) made of a recording, "
+        "and write a result folder. FILE is TUM (stamp in seconds, x y z qx qy qz qw), or, ending in .csv, BOP "
+        "(scene_id,im_id,obj_id,score,R,t,time), or a folder of NUMBER.txt with a 4 x 4 matrix each. Poses map the "
+        "CAD file's own axes to the OpenCV camera, in metres (BOP: millimetres). `hat bench --poses NAME=FILE` puts "
+        "them into the table beside the others.",
     )
     parser.add_argument("recording", type=Path, help="bag, folder of the `sequence` layout, or root of a data set")
     parser.add_argument(
