@@ -18,6 +18,7 @@ from hat_ros import lie
 from hat_ros.config import HatConfig
 from hat_ros.core.fusion import FusionStage
 from hat_ros.core.guard import candidates_from_recording, guard_candidates
+from hat_ros.core.offline import solve_offline
 from hat_ros.core.selector import SelectorStage
 from hat_ros.errors import CandidateError, InputError
 from hat_ros.types import Camera, Candidates, Float, Frame, Motion, TrackState
@@ -137,6 +138,22 @@ def run_temporal(observations: Observations, config: HatConfig) -> TemporalResul
             T_cam_target[t], held[t] = estimate.T_cam_target, estimate.state == TrackState.COASTING
         chosen[t], accepted[t], n_resets[t + 1] = selection.selected, selector.accepted, estimate.n_resets
     return TemporalResult(T_cam_target, chosen, accepted, np.flatnonzero(np.diff(n_resets)), held)
+
+
+def run_offline(observations: Observations, config: HatConfig) -> TemporalResult:
+    """What hindsight makes of the same observations: a reference, not causal (see :mod:`hat_ros.core.offline`).
+
+    ``accepted`` marks the anchors that counted; there are no resets, and nothing is said to be held.
+
+    Raises:
+        CandidateError: as in :func:`run_temporal`.
+    """
+    n = len(observations)
+    candidates = [observations.candidates(t, config.hypotheses.guard) for t in range(n)]
+    result = solve_offline(candidates, [observations.motion(t) for t in range(n)], config)
+    accepted = result.gate_weight == 1.0
+    no_resets, not_held = np.zeros(0, dtype=np.int64), np.zeros(n, dtype=bool)
+    return TemporalResult(result.T_cam_target, result.chosen, accepted, no_resets, not_held)
 
 
 def _imageless_frame(index: int) -> Frame:

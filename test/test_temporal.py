@@ -9,7 +9,7 @@ from temporal_scene import HALF_TURN, make_scene, preset, rotation_error_deg
 
 from hat_ros import lie
 from hat_ros.errors import CandidateError, InputError
-from hat_ros.temporal import Observations, load_observations, run_temporal, save_result
+from hat_ros.temporal import Observations, load_observations, run_offline, run_temporal, save_result
 
 PRESETS = ("mega_hat", "pico_hat", "mega_hat_spark")
 
@@ -85,6 +85,21 @@ def test_permuted_candidates_give_permuted_choices_and_the_same_poses(name, scen
     np.testing.assert_array_equal(a.T_cam_target, b.T_cam_target)
     keys = np.flatnonzero(a.chosen >= 0)
     np.testing.assert_array_equal(orders[keys, b.chosen[keys]], a.chosen[keys])
+
+
+@pytest.mark.parametrize("name", ["mega_hat", "pico_hat"])
+def test_offline_poses_do_not_depend_on_the_gauge_and_are_closer_to_the_truth(name):
+    scene = make_scene(100, noise_deg=3)
+    config = preset(name, selector={"running_gate": False})
+    offline = run_offline(scene.observations, config)
+    gauge = lie.transform(lie.so3_exp(np.array([0.4, -2.0, 1.0])), np.array([3.0, 1.0, -2.0]))
+    moved = run_offline(replace(scene.observations, slam=gauge @ scene.observations.slam), config)
+    np.testing.assert_allclose(moved.T_cam_target, offline.T_cam_target, atol=1e-6)
+    np.testing.assert_array_equal(moved.chosen, offline.chosen)
+    assert set(np.flatnonzero(offline.accepted)) <= set(np.flatnonzero(scene.observations.key))
+    causal = run_temporal(scene.observations, config)
+    errors = [rotation_error_deg(r.T_cam_target, scene.T_cam_target).mean() for r in (offline, causal)]
+    assert errors[0] <= errors[1]
 
 
 def test_hat_follows_the_truth_where_appearance_flips():

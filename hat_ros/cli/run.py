@@ -150,12 +150,14 @@ def _add_temporal(commands: Commands) -> None:
     parser.add_argument("observations", type=Path, metavar="OBS.npz", help="recorded observations")
     parser.add_argument("--out", required=True, type=Path, metavar="OUT.npz", help="file to write")
     add_config(parser)
+    parser.add_argument("--offline", action="store_true", help="the offline reference: all frames jointly, not causal")
     parser.set_defaults(command=_temporal)
 
 
 def _temporal(arguments: argparse.Namespace) -> int:
-    from hat_ros.temporal import load_observations, run_temporal, save_result
+    from hat_ros.temporal import load_observations, run_offline, run_temporal, save_result
 
+    run = run_offline if arguments.offline else run_temporal
     config = config_of(arguments)
-    save_result(arguments.out, run_temporal(load_observations(arguments.observations), config))
+    save_result(arguments.out, run(load_observations(arguments.observations), config))
     return 0
