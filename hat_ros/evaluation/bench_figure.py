@@ -39,6 +39,7 @@ def bench_figure(rows: Sequence[dict[str, Any]], panel: str = "clip") -> Figure:
         axis.set_title(str(name), fontsize=10)
     for axis in axes.flat[len(names) :]:
         axis.set_visible(False)
+    figure.supxlabel("bars: mean $E_p$, whiskers: one SD, diamonds: frames/s", fontsize=8, color="#555555")
     return figure
 
 
@@ -50,8 +51,13 @@ def _panel(axis: Axes, rows: Sequence[dict[str, Any]]) -> None:
     has_sd = np.isfinite(mean) & np.isfinite(sd)
     upwards = [np.zeros(np.count_nonzero(has_sd)), sd[has_sd]]
     axis.errorbar(x[has_sd], mean[has_sd], yerr=upwards, fmt="none", ecolor="#444444", capsize=3, linewidth=1)
+    for at, top, value in zip(x, mean + np.nan_to_num(sd), mean, strict=True):
+        if np.isfinite(value):
+            # Three digits: bars of a good method are too low to be read against those of a bad one.
+            axis.annotate(f"{value:.3g}", (at, top), (0, 2), textcoords="offset points", ha="center", fontsize=7)
     axis.set_xticks(x, labels, rotation=30, ha="right", fontsize=8)
     axis.set_ylabel("$E_p$", fontsize=9)
+    axis.margins(y=0.12)
     axis.set_ylim(bottom=0)
     speed = axis.twinx()
     speed.plot(x, fps, "D", color=_DIAMOND_COLOR, markersize=6, markeredgecolor="black", markeredgewidth=0.6)
