@@ -9,17 +9,20 @@ from numpy.typing import NDArray
 from hat_ros import lie
 from hat_ros.config import RefinementConfig
 from hat_ros.refinement.covariance import outline_floor, pose_covariance
-from hat_ros.refinement.refiner import WITH_MASK, WITHOUT_MASK, PoseFitter
+from hat_ros.refinement.refiner import WITH_MASK, WITHOUT_MASK, Fit, PoseFitter
 from hat_ros.refinement.sunlight import SunMatcher
 from hat_ros.refinement.view import MaskField, Overlap, TargetViewer
 from hat_ros.target import Target
-from hat_ros.types import Detection, Frame, Refined
+from hat_ros.types import Camera, Detection, Frame, Refined
 
 # The mask's robust scales are meant for a target of this size or more and shrink with smaller ones.
 _USUAL_SIZE_PX = 250.0
 # Share of a silhouette that is black on black from which the sun is looked for.
 _SHADOW_SHARE = 0.15
 _SCALE_LIMITS = (0.4, 1.0)
+# From a good prediction the fine round alone arrives: this share of the contour agrees, and nothing moved further.
+_ENOUGH_SUPPORT = 0.7
+_SMALL_MOVE_PX = 2.0
 
 
 class FusedPoseRefiner:
@@ -33,6 +36,7 @@ class FusedPoseRefiner:
     def __init__(self, config: RefinementConfig, target: Target) -> None:
         self._config = config
         self._target = target
+        self._start_sigma_rad = np.radians(config.start_sigma_deg)
         self._viewer = TargetViewer(target)
         self._sun = SunMatcher(self._viewer)
         self._fitter = PoseFitter(self._viewer, config.render_px, config.max_points)
@@ -51,18 +55,15 @@ class FusedPoseRefiner:
         """
         field = MaskField(detection.mask) if detection is not None and detection.silhouette else None
         luma = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        rounds, start = WITHOUT_MASK, T_cam_target
+        start = T_cam_target
         if field is not None:
-            factor = float(np.clip(field.size_px / _USUAL_SIZE_PX, *_SCALE_LIMITS))
-            rounds = (WITH_MASK[0].scaled(factor), *WITH_MASK[1:])
             start = self._fitter.centred(T_cam_target, frame.camera, field, luma)
-        sigma = np.radians(self._config.start_sigma_deg)
-        fit = self._fitter.fit(start, frame.camera, frame.rgb, field, rounds, sigma)
+        fit = self._fit(frame, field, start)
         if fit is not None and field is not None and _lies_in_shadow(field.compare(fit.view, luma)):
             # Part of the silhouette cannot be seen: find out which, and fit what can.
             sunlight = self._sun.match(start, frame, field.mask)
             if sunlight is not None:
-                fit = self._fitter.fit(start, frame.camera, frame.rgb, field, rounds, sigma, sunlight.to_sun_cam) or fit
+                fit = self._fit_all(frame, field, start, sunlight.to_sun_cam) or fit
         if fit is None or not self._same_basin(start, fit.T_cam_target):
             return None
         covariance = pose_covariance(fit, self._target.bounding_radius_m)
@@ -70,15 +71,48 @@ class FusedPoseRefiner:
             return None
         focal_px = float(frame.camera.K[0, 0])
         covariance = covariance + outline_floor(fit.T_cam_target, focal_px, self._target.bounding_radius_m)
-        # The last round starts where the one before it converged: its view is the result's but for part of a pixel.
+        # The last round starts close to where it ends: its view is the result's, but for a pixel or two at most.
         overlap = visible_overlap = float("nan")
         if field is not None:
             areas = field.compare(fit.view, luma)
             overlap, visible_overlap = areas.union_share, areas.visible_share
         return Refined(lie.row_from_matrix(fit.T_cam_target), covariance, overlap, fit.support, visible_overlap)
 
+    def _fit(self, frame: Frame, field: MaskField | None, start: NDArray[np.float64]) -> Fit | None:
+        """The finest round alone where that explains the image and hardly moves the start, else all rounds."""
+        if field is not None:
+            fine = self._fitter.fit(start, frame.camera, frame.rgb, field, WITH_MASK[-1:], self._start_sigma_rad)
+            if (
+                fine is not None
+                and fine.support >= _ENOUGH_SUPPORT
+                and self._largest_move_px(start, fine.T_cam_target, frame.camera) <= _SMALL_MOVE_PX
+            ):
+                return fine
+        return self._fit_all(frame, field, start)
+
+    def _fit_all(
+        self,
+        frame: Frame,
+        field: MaskField | None,
+        start: NDArray[np.float64],
+        to_sun_cam: NDArray[np.float64] | None = None,
+    ) -> Fit | None:
+        """All rounds, from the widest to the finest."""
+        rounds = WITHOUT_MASK
+        if field is not None:
+            factor = float(np.clip(field.size_px / _USUAL_SIZE_PX, *_SCALE_LIMITS))
+            rounds = (WITH_MASK[0].scaled(factor), *WITH_MASK[1:])
+        return self._fitter.fit(start, frame.camera, frame.rgb, field, rounds, self._start_sigma_rad, to_sun_cam)
+
     def reset(self) -> None:
         """Nothing to forget: every frame stands for itself."""
+
+    def _largest_move_px(self, T_before: NDArray[np.float64], T_after: NDArray[np.float64], camera: Camera) -> float:
+        """Largest displacement in the image of six points around the target."""
+        out = self._target.bounding_radius_m * np.concatenate([np.eye(3), -np.eye(3)])
+        points = self._target.center_m + out
+        before, after = (camera.project(points @ T[:3, :3].T + T[:3, 3]) for T in (T_before, T_after))
+        return float(np.linalg.norm(after - before, axis=1).max())
 
     def _same_basin(self, T_before: NDArray[np.float64], T_after: NDArray[np.float64]) -> bool:
         turn = np.degrees(lie.angle_between(T_before[:3, :3], T_after[:3, :3]))
