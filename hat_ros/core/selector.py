@@ -82,13 +82,18 @@ def motion_penalty(
     current_motion: Motion,
     config: SelectorConfig,
 ) -> Float:
-    """mu d(R_{j,k}, Delta R_{j-1,h}) between the survivors of two keyframes: (k, h), zero without an increment."""
+    """mu d(R_{j,k}, Delta R_{j-1,h}) between the survivors of two keyframes: (k, h), zero without an increment.
+
+    Our extension: at most ``max_motion_penalty``, if that is set. The published penalty takes it for granted that the
+    true orientation was among the earlier candidates; where it was not, no evidence could ever make up for half a turn.
+    """
     increment = rotation_increment(previous_motion, current_motion)
     if increment is None:
         return np.zeros((len(current_alive), len(previous_alive)))
     predicted = increment @ previous.T_cam_target[previous_alive, :3, :3]
     angle = lie.angle_between(current.T_cam_target[current_alive, None, :3, :3], predicted[None])
-    return config.motion_weight_per_deg * np.degrees(angle)
+    penalty = config.motion_weight_per_deg * np.degrees(angle)
+    return np.minimum(penalty, config.max_motion_penalty) if config.max_motion_penalty > 0 else penalty
 
 
 def scaled_score(candidates: Candidates, config: SelectorConfig) -> Float:

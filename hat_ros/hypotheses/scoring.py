@@ -23,7 +23,7 @@ _MISMATCH_PX = 0.3
 # Share of the mask's surroundings that is black before a black sky.
 _DARK_SHARE = 0.7
 # Independent samples in a reduced image: residuals err together over parts of the body.
-LIGHT_WEIGHT = 12.0
+LIGHT_WEIGHT = 18.0
 # Light is looked for this far around the mask, above the sky's noise in grey levels; the least sum that tells anything.
 _HALO_PX = 9
 _SKY_NOISE = 2.0

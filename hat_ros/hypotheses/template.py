@@ -53,7 +53,7 @@ _SELECTION_TOLERANCE_PX = 1.0
 # Best shape score below which the mask is taken to be incomplete.
 _POOR_SCORE = -6.0
 # Score short of the best at which no sunlight helps.
-_LIGHT_MATTERS = 10.0
+_LIGHT_MATTERS = 14.0
 # Candidates of different searches closer than this are the same.
 _SAME_DEG = 8.0
 _FIRST = Schedule((0, 0, 0, 0), (1, 1, 1, 1), (6, 4, 3, 2))

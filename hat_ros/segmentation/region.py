@@ -138,8 +138,8 @@ def edge_contrast(rgb: NDArray[np.uint8], mask: Mask) -> tuple[float, float]:
     """How clearly the mask's outline shows.
 
     Returns:
-        Lower quartile of the colour step (8-bit, across two pixels) along the outline inside the image, and upper
-        quartile of the steps in the background, where an outline drawn by chance would lie; zeros without an outline.
+        Lower quartile of the colour step (8-bit, across two pixels) along the outline inside the image, and median of
+        the steps in the background, where an outline drawn by chance would lie; zeros without an outline.
     """
     outer = cv2.dilate(mask, np.ones((3, 3), np.uint8))
     inner = cv2.erode(mask, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
@@ -152,4 +152,4 @@ def edge_contrast(rgb: NDArray[np.uint8], mask: Mask) -> tuple[float, float]:
     dx = cv2.Sobel(rgb, cv2.CV_32F, 1, 0, ksize=3, scale=0.25)
     dy = cv2.Sobel(rgb, cv2.CV_32F, 0, 1, ksize=3, scale=0.25)
     step = np.sqrt((dx * dx + dy * dy).sum(axis=2))
-    return float(np.percentile(step[outline], 25)), float(np.percentile(step[away], 75)) if away.any() else 0.0
+    return float(np.percentile(step[outline], 25)), float(np.median(step[away])) if away.any() else 0.0

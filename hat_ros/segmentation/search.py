@@ -23,6 +23,7 @@ _MIN_FOUND = 0.6
 _MAX_STILL = 0.25
 _FOUND_BONUS = 0.1
 _MOTION_RELIEF = 0.1  # ... a mask that motion could have spoken against needs less, ...
+_COARSE_BENEFIT = 0.15  # ... and one that misses this little gets a closer look; ...
 CUT_SURCHARGE = 0.1  # ... one that the border cuts needs more, since part of a silhouette fits many things.
 # How far an outline may move within a frame, of the target's length: 4 degrees and then some; and in pixels.
 _MARGIN_SHARE = 0.05
@@ -92,10 +93,11 @@ class Search:
             if contrast < max(MIN_CONTRAST, chance):
                 continue
             score = self._plausibility(cut, motion)
-            if score >= max(self._required(cut, motion), best_score + margin):
+            if score >= max(self._required(cut, motion) - _COARSE_BENEFIT, best_score + margin):
                 best, best_score = cut, score
         if best is None:
             return None
+        required = self._required(best, motion)
         mask = whole.enlarge(best)
         x, y, w, h = cv2.boundingRect(mask)
         margin = margin_px(mask)
@@ -106,6 +108,11 @@ class Search:
         cut = region.cut_from_seeds(window.rgb, [window.reduce(mask)], margin * window.scale, models)
         if cut is None:
             return None
+        if best_score < required:
+            # A small target's shape is lost at the scale of the search: judge what a closer look finds.
+            best_score += self._bank.overlap(cut.astype(bool)) - self._bank.overlap(best.astype(bool))
+            if best_score < required:
+                return None
         contrast, _ = region.edge_contrast(window.rgb, cut)
         return Found(at_full_resolution(rgb, window, cut), best_score, contrast, models)
 

@@ -50,7 +50,7 @@ def _best_endpoint_by_enumeration(keyframes, config):
                 increment = motion_after.T_slam_cam[:3, :3].T @ motion_before.T_slam_cam[:3, :3]
                 predicted = increment @ before.T_cam_target[i, :3, :3]
                 angle = np.degrees(lie.angle_between(after.T_cam_target[j, :3, :3], predicted))
-                total -= config.motion_weight_per_deg * angle
+                total -= min(config.motion_weight_per_deg * angle, config.max_motion_penalty or np.inf)
         best[path[-1]] = max(best[path[-1]], total)
     return best
 
@@ -67,6 +67,28 @@ def test_the_recurrence_finds_what_enumerating_all_paths_finds(seed, dropped, mi
         alive = np.isfinite(expected)
         np.testing.assert_allclose(selection.path_score[alive], (expected - expected.max())[alive], atol=1e-9)
         assert np.isneginf(selection.path_score[~alive]).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_limited_penalty_is_still_the_best_of_all_paths(seed):
+    config = SelectorConfig(warmup_keyframes=1, max_motion_penalty=8.0)
+    keyframes = _keyframes(seed)
+    expected = _best_endpoint_by_enumeration(keyframes, config)
+    selection = _run(keyframes, config)[-1]
+    np.testing.assert_allclose(selection.path_score, expected - expected.max(), atol=1e-9)
+
+
+def test_an_orientation_missing_at_first_wins_once_evidence_exceeds_the_limit():
+    """Its history can only begin at a wrong candidate, half a turn away."""
+    wrong, right = np.eye(3), lie.so3_exp(np.array([np.pi, 0.0, 0.0]))
+    row = lie.row_from_matrix(lie.transform(np.stack([wrong, right]), np.zeros((2, 3))))
+    still = _motion(np.eye(3))
+    keyframes = [(Candidates(row[:1], np.zeros(1)), still)] * 3
+    keyframes += [(Candidates(row, np.array([0.0, 1.5])), still)] * 8
+    limited = _run(keyframes, SelectorConfig(score_scale=1.0, max_motion_penalty=8.0))
+    published = _run(keyframes, SelectorConfig(score_scale=1.0))
+    assert [s.selected for s in limited[3:]] == [0] * 5 + [1] * 3
+    assert all(s.selected == 0 for s in published)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -133,6 +133,22 @@ def test_found_from_nothing_before_moving_ground(stage, scene):
     assert (run(stage, scene, lambda T, i: None) > 0.9).all()
 
 
+@pytest.mark.parametrize("angle", [0.0, 0.4, 0.8])
+def test_a_small_target_before_broken_clouds_is_found_from_nothing(stage, scene, angle):
+    """Their edges are stronger than the target's outline, and its shape is coarse at the scale of the search."""
+    T = scene.pose(angle, x=0.2, y=0.1, z=12.0)
+    truth = scene.truth(T)
+    rng = np.random.default_rng(3)
+    patches = cv2.resize(rng.random((12, 16)).astype(np.float32), (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+    clouds = patches + 0.15 * cv2.GaussianBlur(rng.standard_normal((HEIGHT, WIDTH)).astype(np.float32), (0, 0), 1) > 0.6
+    clouds &= np.hypot(*(np.mgrid[:HEIGHT, :WIDTH] - np.argwhere(truth).mean(axis=0)[:, None, None])) > 45
+    ground = np.where(clouds[..., None], np.uint8(235), np.array([25, 60, 120], np.uint8))
+    rgb = np.where(truth[..., None], scene.image(T), ground).astype(np.uint8)
+    found = stage.update(frame(0, cv2.GaussianBlur(rgb, (0, 0), 0.6)), None)
+    assert found is not None
+    assert overlap(found.mask, truth) > 0.8
+
+
 def test_a_prior_keeps_the_mask(stage, scene):
     assert (run(stage, scene, lambda T, i: prior(T) if i > 4 else None, frames=20) > 0.92).all()
 
