@@ -187,7 +187,7 @@ def test_interrupting_leaves_a_readable_result_and_no_process(clean_bag, config,
 
 def test_a_stage_that_hangs_is_named(clean_bag, config, tmp_path):
     def stop(progress):
-        if progress.done == 3:
+        if progress.done >= 3:  # an answer may bring several statuses with it, so 3 itself may be skipped
             os.kill(node_pid("hypotheses"), signal.SIGSTOP)
 
     impatient = changed(config, graph={"stage_timeout_s": 6.0})
@@ -201,7 +201,7 @@ def test_live_goes_on_in_a_new_epoch_after_a_stage_hung(clean_bag, config, tmp_p
     pid = []
 
     def watch(progress):
-        if progress.done == 3 and not pid:
+        if progress.done >= 3 and not pid:
             pid.append(node_pid("selector"))
             os.kill(pid[0], signal.SIGSTOP)
             signal.signal(signal.SIGALRM, lambda *_: os.kill(pid[0], signal.SIGCONT))
