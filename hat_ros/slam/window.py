@@ -262,7 +262,9 @@ class Window:
         self.R_emitted[-1] = chained
 
     def step_sigma_rad(self) -> float:
-        """One-sigma angle of the turn from the last frame but one to the last."""
+        """One-sigma angle of the turn from the last frame but one to the last; infinite while nothing is known."""
+        if not np.isfinite(self.covariance).all():
+            return float("inf")
         A = self.R[-1] @ self.R[-2].T
         J = np.zeros((3, 12))
         J[:, :3], J[:, 6:9] = -A, np.eye(3)
