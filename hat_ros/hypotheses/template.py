@@ -7,9 +7,9 @@
 4. The evidence of each is turned into a log-likelihood (``scoring``): how well its outline and the mask's agree, and
    how well it explains what is bright and what is dark (``refinement.sunlight``).
 
-Before a black sky the mask holds what is lit, which need not be the whole target. Unless the best candidate is where
-the track expects it, matches of brightness (``lit_bank``) then compete as well: of those only the sunlit part of the
-contour is compared with the mask.
+Unless the best candidate is where the track expects it, more is tried. A mask that no view fits well is matched as part
+of a silhouette. Before a black sky the mask holds what is lit, which need not be the whole target: matches of brightness
+(``lit_bank``) then compete as well, and of those only the sunlit part of the contour is compared with the mask.
 """
 
 from __future__ import annotations
@@ -112,13 +112,15 @@ class TemplateHypotheses:
         if prior is not None and prior.healthy:
             starts.append(Start(self._fitter.centred(prior.T_cam_target, frame.camera, field, scorer.luma)))
         aligned = self._align(starts + self._coarse(whole_placement(mask), frame, field), frame, scorer)
-        if not aligned or max(a.score for a in aligned) < _POOR_SCORE:
+        best = max(aligned, key=lambda a: a.score, default=None)
+        if best is None or (best.score < _POOR_SCORE and not self._confirms(best.T_cam_target, prior)):
             # The mask is not the whole silhouette: look for those that it may be a part of.
             cut = detection.touches_border()
             placements = cut_placements(mask) if cut else partial_placements(mask)
             aligned += self._align(self._coarse(placements, frame, field), frame, scorer)
         scored = self._finish(self._select(aligned), frame, scorer)
-        if scorer.dark_around and not self._confirmed(prior, scored):
+        leader = max(scored, key=lambda pair: pair[1], default=None)
+        if scorer.dark_around and (leader is None or not self._confirms(leader[0], prior)):
             # What lies in shadow is missing from the mask: compare what is bright.
             lit = self._align(self._coarse_lit(frame, scorer), frame, scorer)
             scored += self._finish(lit, frame, scorer)
@@ -196,12 +198,11 @@ class TemplateHypotheses:
         R = np.stack([a.T_cam_target[:3, :3] for a in ordered])
         return [ordered[i] for i in distinct(R, self._max_candidates, np.radians(self._options.separation_deg))]
 
-    def _confirmed(self, prior: PosePrior | None, scored: list[tuple[NDArray[np.float64], float]]) -> bool:
-        """Whether the best candidate is the healthy prior's: then nothing else is looked for."""
-        if prior is None or not prior.healthy or not scored:
+    def _confirms(self, T_cam_target: NDArray[np.float64], prior: PosePrior | None) -> bool:
+        """Whether a candidate that leads is the healthy prior's: then nothing else is looked for."""
+        if prior is None or not prior.healthy:
             return False
-        best = max(scored, key=lambda pair: pair[1])[0]
-        apart_rad = lie.angle_between(best[:3, :3], prior.T_cam_target[:3, :3])
+        apart_rad = lie.angle_between(T_cam_target[:3, :3], prior.T_cam_target[:3, :3])
         return bool(apart_rad < np.radians(self._options.separation_deg))
 
     def _finish(self, starts: list[Aligned], frame: Frame, scorer: Scorer) -> list[tuple[NDArray[np.float64], float]]:
