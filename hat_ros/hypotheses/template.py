@@ -7,9 +7,9 @@
 4. The evidence of each is turned into a log-likelihood (``scoring``): how well its outline and the mask's agree, and
    how well it explains what is bright and what is dark (``refinement.sunlight``).
 
-Unless the best candidate is where the track expects it, more is tried. A mask that no view fits well is matched as part
-of a silhouette. Before a black sky the mask holds what is lit, which need not be the whole target: matches of brightness
-(``lit_bank``) then compete as well, and of those only the sunlit part of the contour is compared with the mask.
+Unless the best candidate is where the track expects it, more is tried. A mask that no view fits well is matched as
+part of a silhouette. Before a black sky the mask holds what is lit, which need not be the whole target: matches of
+brightness (``lit_bank``) compete as well, and of those only the sunlit part of the contour is compared with the mask.
 """
 
 from __future__ import annotations
