@@ -140,12 +140,12 @@ class FeatureSlam:
             if prior is not None and prior.healthy:
                 self._surface.expect(window, tracks.track_id, prior)
         window.adjust()
-        self._try_rivals()
+        self._try_rivals(prior)
         window.emit()
         self._replenish(image, region)
         return True
 
-    def _try_rivals(self) -> None:
+    def _try_rivals(self, prior: PosePrior | None) -> None:
         """Now and then ask whether another solution, or another opinion of the prior, explains the tracks better."""
         window = self._window
         prior_known = np.count_nonzero(window.n_looks) >= _MIN_POINTS
@@ -158,8 +158,11 @@ class FeatureSlam:
         if phase == 0 and len(window) > 3:
             if window.trusts_prior and turn % 2 == 0:
                 window.challenge_prior()
-            else:
+            elif prior is None or self._target is None:
                 window.challenge_structure()
+            else:
+                turn = lie.so3_log(prior.T_cam_target[:3, :3] @ lie.matrix_from_row(prior.fused_row)[:3, :3].T)
+                window.challenge_structure(prior.stamp_ns, turn)
         elif phase == 2 and prior_known and window.prior_agreement() < _MIN_PRIOR_AGREEMENT:
             window.try_prior()
 

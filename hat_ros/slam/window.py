@@ -37,6 +37,8 @@ _YOUNG_CUTOFFS = (8.0, 4.0, 2.0)
 # A rival solution must be this much cheaper, relative and absolute, to take over.
 _RIVAL_SHARE, _RIVAL_MARGIN = 0.9, 20.0
 _RIVAL_ITERATIONS = 8
+# Turn from which its direction is beyond doubt, and how much of it two opinions that agree may differ by.
+_TELLING_TURN_RAD, _AGREEING_SHARE = np.radians(0.8), 0.5
 # A prior is dropped when the cost without it is lower by this much per observation and is this share of the cost with
 # it; it comes back when it costs less than this more. Right priors of 3 degrees noise stay at half the gain.
 _DISTRUST_GAIN, _DISTRUST_SHARE = 0.04, 0.7
@@ -186,11 +188,17 @@ class Window:
         state, problem = (self.R, self.t, self.X), self._problem(self.trusts_prior)
         self.cost, self.covariance = self._descend(state, problem, self._config.iterations)
 
-    def challenge_structure(self) -> None:
-        """Let the depth-reversed solution take over if it explains the tracks better.
+    def challenge_structure(self, since_ns: int = -1, turn: Float | None = None) -> None:
+        """Let the depth-reversed solution take over if it explains the tracks better, or as well and the turn better.
 
         Seen from afar, a relief turning one way and its mirror image turning the other way look the same (Necker
-        reversal); only perspective and expected points tell them apart, and the descent cannot cross over.
+        reversal); only perspective and expected points tell them apart, and the descent cannot cross over. Where the
+        tracks leave it open, fused poses that nobody vouches for may still know which way the target turns.
+
+        Args:
+            since_ns: stamp of a frame of the window.
+            turn: (3,) rotation vector of the target in the camera frame from then to the newest frame as fused poses
+                have it, None when they say nothing.
         """
         k = len(self) // 2
         in_camera = self.points_in_camera(self.R[k], self.t[k])
@@ -205,8 +213,20 @@ class Window:
         cost, _ = self._descend((R, t, X), problem, _RIVAL_ITERATIONS)
         if self.trusts_prior:
             self._distrust_for((R, t, X), cost)
-        elif cost < _RIVAL_SHARE * self.cost - _RIVAL_MARGIN:
+            return
+        is_better = cost < _RIVAL_SHARE * self.cost - _RIVAL_MARGIN
+        is_as_good = cost < self.cost / _RIVAL_SHARE + _RIVAL_MARGIN
+        if is_better or (is_as_good and turn is not None and self._turns_better(R, since_ns, turn)):
             self.R, self.t, self.X, self.X_guess = R, t, X, X.copy()
+
+    def _turns_better(self, R: Float, since_ns: int, turn: Float) -> bool:
+        """Whether other rotations (W, 3, 3) clearly agree with an expected turn and the present ones clearly do not."""
+        size = float(np.linalg.norm(turn))
+        if since_ns not in self.stamps_ns or size < _TELLING_TURN_RAD:
+            return False
+        k = self.stamps_ns.index(since_ns)
+        present, other = (np.linalg.norm(turn_between(Q[-1], Q[k]) - turn) / size for Q in (self.R, R))
+        return bool(other < _AGREEING_SHARE and present > 2.0 * _AGREEING_SHARE)
 
     def challenge_prior(self) -> None:
         """Stop trusting the prior if the tracks are explained much better without it."""

@@ -8,6 +8,7 @@ from speckled_clip import CAMERA, FRAME_NS, speckled_clip, turn_errors_deg
 
 from hat_ros import lie
 from hat_ros.config import FeatureSlamConfig, HatConfig, PriorConfig, SlamConfig
+from hat_ros.slam.bundle import turn_between
 from hat_ros.slam.feature import FeatureSlam, bulge
 from hat_ros.types import Camera, Detection, Frame
 
@@ -104,6 +105,22 @@ def test_priors_that_start_late_keep_gauge_and_epoch(clip):
 def test_unhealthy_priors_are_not_used(clip, motions):
     found = run(FeatureSlam(config(), clip.target), clip, lambda i: clip.prior(i, healthy=False))
     assert [motion.pose_row.tobytes() for motion in found] == [motion.pose_row.tobytes() for motion in motions]
+
+
+def test_where_the_tracks_leave_the_relief_open_the_fused_turn_decides(clip, monkeypatch):
+    slam = FeatureSlam(config(), clip.target)
+    run(slam, clip, last=16)
+    window = slam._window
+    monkeypatch.setattr(window, "_descend", lambda state, problem, n: (window.cost, window.covariance))
+    since_ns, before = window.stamps_ns[-5], window.R.copy()
+    own = turn_between(window.R[-1], window.R[-5])
+    for opinion in (None, own, own * 1.3, np.zeros(3)):
+        window.challenge_structure(since_ns, opinion)
+        np.testing.assert_array_equal(window.R, before)
+    reversed_turn = own * [-1, -1, 1]
+    window.challenge_structure(since_ns, reversed_turn)
+    now = turn_between(window.R[-1], window.R[-5])
+    assert np.linalg.norm(now - reversed_turn) < 0.5 * np.linalg.norm(own)
 
 
 def test_use_prior_false_ignores_priors(clip, motions):
