@@ -19,28 +19,6 @@ _REQUIRED = ("numpy", "scipy", "opencv-python-headless", "trimesh", "embreex", "
              "rich", "matplotlib", "zstandard")  # fmt: skip
 _OPTIONAL = {"torch": "nets", "transformers": "nets", "safetensors": "nets", "pyrender": "gl", "distributed": "cluster"}
 
-# Two participants in one process: what a machine with a blocked loopback or shared memory cannot do.
-_DDS_PROBE = """
-import sys, time
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from std_msgs.msg import Header
-rclpy.init()
-node = rclpy.create_node("hat_doctor")
-got = []
-node.create_subscription(Header, "hat_doctor", got.append, 10)
-publisher = node.create_publisher(Header, "hat_doctor", 10)
-executor = SingleThreadedExecutor()
-executor.add_node(node)
-end = time.monotonic() + 8
-while not got and time.monotonic() < end:
-    publisher.publish(Header(frame_id="x"))
-    executor.spin_once(timeout_sec=0.1)
-node.destroy_node()
-rclpy.shutdown()
-sys.exit(0 if got else 1)
-"""
-
 
 @dataclass(frozen=True)
 class Finding:
@@ -158,7 +136,9 @@ def _ros() -> list[Finding]:
         return [Finding("rclpy", "missing", "not importable; run `make install` (hat track works without it)")]
     out = [Finding("rclpy", "ok", found.stdout.strip())]
     try:
-        dds = subprocess.run([sys.executable, "-c", _DDS_PROBE], capture_output=True, timeout=60, env=environment)
+        dds = subprocess.run(
+            [sys.executable, "-m", "hat_ros.nodes.probe"], capture_output=True, timeout=60, env=environment
+        )
         good = dds.returncode == 0
     except subprocess.TimeoutExpired:
         good = False

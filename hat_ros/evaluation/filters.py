@@ -10,6 +10,7 @@ index, so everything downstream stays the same.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,7 +42,7 @@ class FilterNoise:
     seed: int = 0
 
 
-class _FilterSelector:
+class _FilterSelector(ABC):
     """What both filters share: book-keeping around one prediction and one update per keyframe."""
 
     def __init__(self, config: SelectorConfig, noise: FilterNoise | None = None) -> None:
@@ -69,15 +70,17 @@ class _FilterSelector:
         path_score[alive] = support - support.max()
         return Selection(candidates, scaled, path_score, int(alive[np.argmax(support)]))
 
+    @abstractmethod
     def _start(self, R: Float, log_weight: Float) -> None:
-        raise NotImplementedError
+        """Begin with the first candidates (n, 3, 3) and their scaled scores (n,)."""
 
+    @abstractmethod
     def _predict(self, increment: Float | None) -> None:
-        raise NotImplementedError
+        """Turn the state by an increment (3, 3), or spread it when none is known."""
 
+    @abstractmethod
     def _correct(self, R: Float, log_weight: Float) -> Float:
         """Update with the candidates; returns the log-support of each."""
-        raise NotImplementedError
 
 
 class ParticleSelector(_FilterSelector):
