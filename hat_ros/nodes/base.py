@@ -173,8 +173,6 @@ class HatNode(LifecycleNode):
         except HatError as error:
             self.fail(error)
         except Exception as error:
-            if not self.context.ok():  # a signal came in between: there is nothing left to publish with
-                return
             self.get_logger().error(traceback.format_exc())
             self.fail(RunError(f"{type(error).__name__}: {error}"))
 
@@ -246,8 +244,6 @@ class HatNode(LifecycleNode):
         self._publish_diagnostics()
 
     def _publish_diagnostics(self) -> None:
-        if not self.context.ok():
-            return
         name = f"hat: {self.NAME}"
         message = self.wire.diagnostics(time.time_ns(), name, self._level, self._text, self.values())
         self._diagnostics.publish(message)

@@ -42,6 +42,20 @@ def test_a_stopped_recorder_closes_its_bag(tmp_path, number):
 
 
 @pytest.mark.graph
+def test_a_node_stopped_at_any_moment_ends_without_a_trace(tmp_path):
+    with reserved_domain(None) as domain:
+        processes = [start("recorder_node", f"out:={tmp_path / f'out{k}'}", domain=domain) for k in range(2)]
+        for k, process in enumerate(processes):
+            while not (tmp_path / f"out{k}").exists() and process.poll() is None:  # its start has begun
+                time.sleep(0.01)
+            time.sleep(0.15 * k)
+            process.send_signal(signal.SIGTERM)
+            process.send_signal(signal.SIGINT)
+        ends = [(process.communicate(timeout=30)[1], process.returncode) for process in processes]
+    assert ends == [("", 0)] * 2
+
+
+@pytest.mark.graph
 def test_bad_parameters_are_one_sentence_and_exit_code_two():
     with reserved_domain(None) as domain:
         process = start("selector_node", "selector.score_scal:=1.0", domain=domain)
