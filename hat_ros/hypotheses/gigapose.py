@@ -23,7 +23,7 @@ from hat_ros.types import Candidates, Detection, Frame, PosePrior
 
 LOG = logging.getLogger(__name__)
 
-_FORMAT = 2
+_FORMAT = 3
 
 
 class GigaPoseHypotheses:
@@ -53,21 +53,19 @@ class GigaPoseHypotheses:
     def _build(self, target: Target) -> dict[str, NDArray]:
         renderer, poses = NetworkViewRenderer(target), template_poses(target)
         LOG.info("rendering %d templates, once per CAD model", len(poses))
-        crops, masks, Ms = [], [], []
+        crops, Ms = [], []
         for T in poses:
             view = renderer.render(T, TEMPLATE_K, TEMPLATE_SIZE)
-            rgb, mask = view[..., :3], view.any(axis=2)  # a black surface still has a normal
-            M = letterbox(mask)
-            crops.append(cut(rgb, M))
-            masks.append(cut(mask.astype(np.uint8), M))
-            Ms.append(M)
+            mask = view.any(axis=2)  # a black surface still has a normal
+            Ms.append(letterbox(mask))
+            crops.append(cut(view[..., :3], mask, Ms[-1]))
         features, ist = [], []
         for batch in self._runtime.batches(len(poses), self._batch_size):
-            inputs = _network_input(self._runtime.tensor(np.stack(crops[batch])))
+            inputs = _network_input(self._runtime.tensor(np.stack(crops[batch])[..., :3]))
             features.append(self._describe(inputs).cpu().numpy())
             ist.append(self._describe_ist(inputs).cpu().numpy())
             LOG.info("encoded %d of %d templates, once per CAD model and checkpoint", batch.stop, len(poses))
-        small = pp.patch_mask(torch.from_numpy(np.stack(masks).astype(np.float32))).numpy()
+        small = pp.patch_mask(torch.from_numpy(np.stack(crops)[..., 3].astype(np.float32))).numpy()
         arrays = {"features": np.concatenate(features), "ist": np.concatenate(ist), "masks": small}
         return arrays | {"M": np.stack(Ms), "T_cam_target": poses}
 
@@ -76,8 +74,8 @@ class GigaPoseHypotheses:
         """K poses refined by MegaPose, scored by its coarse logits; the prior is not used (published behaviour)."""
         tensor, bank = self._runtime.tensor, self._templates
         M = letterbox(detection.mask)
-        batch = _network_input(tensor(cut(frame.rgb, M))[None])
-        mask = pp.patch_mask(tensor(cut(detection.mask.astype(np.uint8), M))[None])[0]
+        crop = tensor(cut(frame.rgb, detection.mask, M))[None]
+        batch, mask = _network_input(crop[..., :3]), pp.patch_mask(crop[..., 3])[0]
         matches = gp.match(self._describe(batch)[0], mask, bank["features"], bank["masks"])
         scores = torch.stack([m.similarity.sum() for m in matches])
         best = [int(i) for i in scores.topk(min(self._n_candidates, len(scores))).indices if scores[i] > 0]
@@ -102,19 +100,21 @@ def letterbox(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
     rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     size = np.array([cols[-1] + 1 - cols[0], rows[-1] + 1 - rows[0]])
     scale = CROP_PX / size.max()
-    shift = (CROP_PX - scale * size) // 2 - scale * np.array([cols[0], rows[0]])
+    shift = (CROP_PX - size * CROP_PX // size.max()) // 2 - scale * np.array([cols[0], rows[0]])
     return np.array([[scale, 0, shift[0]], [0, scale, shift[1]], [0, 0, 1.0]])
 
 
-def cut(image: NDArray[np.uint8], M: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Crop by ``M`` with nearest sampling and zeros outside: (H, W[, 3]) -> (224, 224[, 3])."""
-    # Pixel edges at integers: crop pixel centre i + 0.5 comes from image pixel floor(M^-1 (i + 0.5)).
-    at = np.arange(CROP_PX) + 0.5
+def cut(image: NDArray[np.uint8], mask: NDArray[np.bool_], M: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Masked crop by ``M`` with nearest sampling, zeros elsewhere: (H, W, 3) and (H, W) -> (224, 224, 4), mask last.
+
+    Crop pixel i shows image pixel floor(M^-1 i), without the half pixel, as in the reference.
+    """
+    at = np.arange(CROP_PX) + 1e-9
     cols, rows = np.floor((at - M[0, 2]) / M[0, 0]).astype(int), np.floor((at - M[1, 2]) / M[1, 1]).astype(int)
     inside = ((rows >= 0) & (rows < image.shape[0]))[:, None] & ((cols >= 0) & (cols < image.shape[1]))[None]
-    out = image[rows.clip(0, image.shape[0] - 1)[:, None], cols.clip(0, image.shape[1] - 1)[None]].copy()
-    out[~inside] = 0
-    return out
+    where = rows.clip(0, image.shape[0] - 1)[:, None], cols.clip(0, image.shape[1] - 1)[None]
+    visible = mask[where] & inside
+    return np.concatenate([image[where] * visible[..., None], visible[..., None]], axis=2, dtype=np.uint8)
 
 
 def _network_input(crops_rgb: Tensor) -> Tensor:

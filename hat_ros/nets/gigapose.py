@@ -90,7 +90,7 @@ class GigaPoseNet(nn.Module):
 
 @dataclass(frozen=True)
 class Matches:
-    """Patch correspondences of one template: (M,) row-major patch indices and their similarities."""
+    """Patch correspondences with one template: (M,) row-major patch indices and their similarities."""
 
     template: Tensor
     image: Tensor
@@ -98,26 +98,28 @@ class Matches:
 
 
 def match(image: Tensor, image_mask: Tensor, templates: Tensor, template_masks: Tensor) -> list[Matches]:
-    """Mutually consistent matches of every template.
+    """The nearest template patch of every image patch, where the way back ends within three patches.
+
+    The reference takes index 0 for "no match" and tests it also on the template's list at the image patch's position;
+    both quirks are kept, since the published numbers were made with them.
 
     Args:
-        image: (C, 16, 16) unit features. image_mask: (16, 16) of 0 and 1. templates: (N, C, 16, 16).
+        image: (C, 16, 16) unit features. image_mask: (16, 16) of 0 and 1. templates: (N, C, 16, 16) unit features.
         template_masks: (N, 16, 16).
 
     Returns:
-        One entry per template; its score is the sum of its similarities over 256.
+        One entry per template; the template's score is the sum of its similarities over 256.
     """
-    similarity = torch.einsum("nct,cs->nts", templates.flatten(2), image.flatten(1))
-    masks = template_masks.flatten(1)[:, :, None] * image_mask.flatten()
-    similarity = torch.where(masks > 0, similarity, torch.zeros_like(similarity))
-    best, to_image = similarity.max(dim=2)
-    back = similarity.argmax(dim=1).gather(1, to_image)
-    index = torch.arange(GRID * GRID, device=image.device)
+    similarity = torch.einsum("ct,ncs->nts", image.flatten(1), templates.flatten(2))
+    masks = image_mask.flatten()[:, None] * template_masks.flatten(1)[:, None]
+    similarity = torch.where((masks > 0) & (similarity >= _MIN_SIMILARITY), similarity, torch.zeros_like(similarity))
+    best, to_template = similarity.max(dim=2)
+    to_image = similarity.argmax(dim=1)
+    back, index = to_image.gather(1, to_template), torch.arange(GRID * GRID, device=image.device)
     dy, dx = back // GRID - index // GRID, back % GRID - index % GRID
     near = torch.hypot(dx.float(), dy.float()) <= _CYCLE_PATCHES
-    # Index 0 is the reference's mark for "no match", so a true match there is lost as well.
-    keep = near & (best > _MIN_SIMILARITY) & (to_image != 0)
-    return [Matches(index[k], to_image[i][k], best[i][k]) for i, k in enumerate(keep)]
+    keep = near & (best > 0) & (to_template != 0) & (to_image != 0)
+    return [Matches(to_template[i][k], index[k], best[i][k]) for i, k in enumerate(keep)]
 
 
 def best_similarity(template_px: Tensor, image_px: Tensor, scale: Tensor, inplane: Tensor) -> tuple[Tensor, Tensor]:
@@ -125,12 +127,12 @@ def best_similarity(template_px: Tensor, image_px: Tensor, scale: Tensor, inplan
 
     Args:
         template_px, image_px: (M, 2) matched positions in crop pixels.
-        scale: (M,) predicted scale. inplane: (M, 2) predicted (cos, sin).
+        scale: (M,) predicted scale. inplane: (M, 2) predicted (cos, sin), not normalised: as published, its length is
+            part of the scale.
 
     Returns:
         (3, 3) affine from template crop to image crop, and its number of inliers.
     """
-    inplane = F.normalize(inplane, dim=1)
     c, s = scale * inplane[:, 0], scale * inplane[:, 1]
     linear = torch.stack([torch.stack([c, -s], dim=1), torch.stack([s, c], dim=1)], dim=1)
     shift = image_px - (linear @ template_px[:, :, None])[..., 0]

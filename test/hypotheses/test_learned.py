@@ -164,10 +164,14 @@ def test_letterbox_keeps_aspect_and_centres():
     mask[30:60, 40:100] = True
     M = gigapose.letterbox(mask)
     assert M[0, 0] == M[1, 1] == 224 / 60
-    crop = gigapose.cut(mask.astype(np.uint8), M)
-    rows = np.flatnonzero(crop.any(axis=1))
-    assert crop.any(axis=0).all()
+    rng = np.random.default_rng(0)
+    image = rng.integers(1, 255, (120, 160, 3), dtype=np.uint8)
+    crop = gigapose.cut(image, mask, M)
+    rows = np.flatnonzero(crop[..., 3].any(axis=1))
+    assert crop[..., 3].any(axis=0).all()
     assert abs(rows[0] - (223 - rows[-1])) <= 1
+    np.testing.assert_array_equal(crop[rows[0], 0], [*image[30, 40], 1])
+    np.testing.assert_array_equal(crop[..., :3].any(axis=2), crop[..., 3] > 0)  # the surroundings are not shown
 
 
 def test_gigapose_one_point_ransac_recovers_a_similarity():
@@ -182,6 +186,51 @@ def test_gigapose_one_point_ransac_recovers_a_similarity():
     assert inliers >= 40
     torch.testing.assert_close(affine[:2, :2], linear, atol=1e-4, rtol=0)
     torch.testing.assert_close(affine[:2, 2], torch.tensor([5.0, -8.0]), atol=1e-2, rtol=0)
+
+
+def test_gigapose_scale_is_stretched_by_the_length_of_the_rotation():
+    point, half = torch.zeros(1, 2), torch.tensor([[0.5, 0.0]])
+    affine, _ = gp.best_similarity(point, point, torch.tensor([3.0]), half)
+    torch.testing.assert_close(affine, torch.diag(torch.tensor([1.5, 1.5, 1.0])))
+
+
+def test_gigapose_parameter_names_are_the_checkpoints():
+    norm = ["weight", "bias", "running_mean", "running_var", "num_batches_tracked"]
+    names = ["conv1.weight", *(f"bn1.{name}" for name in norm), "layer4_outconv.weight"]
+    for layer in range(1, 5):
+        for block in range(2):
+            prefix = f"layer{layer}.{block}"
+            names += [f"{prefix}.conv{i}.weight" for i in (1, 2)]
+            names += [f"{prefix}.bn{i}.{name}" for i in (1, 2) for name in norm]
+        if layer > 1:
+            names += [f"layer{layer}.0.downsample.{name}" for name in ("0.weight", *(f"1.{name}" for name in norm))]
+    names = [f"ist_net.backbone.{name}" for name in names]
+    for head in ("scale_predictor", "inplane_predictor"):
+        names += [f"ist_net.regressor.{head}.{i}.{name}" for i in (0, 2, 4) for name in ("weight", "bias")]
+    with torch.device("meta"):
+        state = gp.GigaPoseNet().state_dict()
+    assert sorted(names) == sorted(name for name in state if name.startswith("ist_net."))
+    assert all(name.startswith(("ist_net.", "ae_net.dinov2_model.")) for name in state)
+
+
+def test_gigapose_matches_each_image_patch_and_forgets_weak_ones():
+    # Both patches of the image look like template patch 40; one is far from where the way back ends.
+    features = torch.zeros(4, 256)
+    features[3] = 1
+    features[:, 40] = torch.tensor([1.0, 0, 0, 0])
+    features[:, 200] = torch.tensor([0.9, 0.435890, 0, 0])
+    features[:, 41] = torch.tensor([0.4, 0, 0.916515, 0])  # below the threshold
+    template = torch.zeros(4, 256)
+    template[2] = 1
+    template[:, 40] = torch.tensor([1.0, 0, 0, 0])
+    mask = torch.zeros(256)
+    mask[[40, 200, 41]] = 1
+    only = torch.zeros(256)
+    only[40] = 1
+    found = gp.match(
+        features.reshape(4, 16, 16), mask.reshape(16, 16), template.reshape(1, 4, 16, 16), only.reshape(1, 16, 16)
+    )
+    assert (found[0].image.tolist(), found[0].template.tolist()) == ([40], [40])
 
 
 def test_gigapose_matches_must_agree_both_ways():
