@@ -9,8 +9,9 @@ from __future__ import annotations
 import resource
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -46,7 +47,7 @@ class Processed:
         frame: the frame as recorded, given mask included.
         step: what the stages said.
         latency_ms: wall time from admission to the answer, waiting behind frames in flight included.
-        decode_ms: wall time of reading and decoding the frame before that.
+        decode_ms: wall time of reading and decoding the frame before that, beside earlier frames.
         stage_ms: wall time by stage, waiting left out.
         rss_mib: resident memory of this process after the step.
         mask_iou: overlap of the detected and the recorded silhouette, NaN when none was recorded.
@@ -101,11 +102,11 @@ class Pipeline:
 
     def run(self, frames: Iterable[Frame | FrameError]) -> Iterator[Processed]:
         """Process frames, answers in order; those with a late stamp or malformed are counted in ``rejected``."""
-        admitted = self._admitted(iter(frames))
         in_flight: deque[Future[Processed]] = deque()
         clock = _Clock()
-        with ThreadPoolExecutor(self._credits, "frame") as threads:
+        with closing(_ReadAhead(frames)) as attempts, ThreadPoolExecutor(self._credits, "frame") as threads:
             try:
+                admitted = self._admitted(attempts)
                 while True:
                     while self._admission.has_credit and (entry := next(admitted, None)) is not None:
                         in_flight.append(threads.submit(self._process, *entry))
@@ -121,13 +122,9 @@ class Pipeline:
         """The collected steps with the answers of a method that gives them only after the last frame."""
         return [replace(step, estimate=final) for step, final in zip(steps, self._method.finish(), strict=True)]
 
-    def _admitted(self, frames: Iterator[Frame | FrameError]) -> Iterator[tuple[int, Frame, float]]:
+    def _admitted(self, attempts: _ReadAhead) -> Iterator[tuple[int, Frame, float]]:
         """Sequence number, frame and decoding time of the frames that may enter; asked only when there is credit."""
-        while True:
-            start = time.perf_counter()
-            frame = next(frames, None)
-            if frame is None:
-                return
+        for frame, decode_ms in attempts:
             try:
                 if isinstance(frame, FrameError):
                     raise frame
@@ -135,7 +132,7 @@ class Pipeline:
             except FrameError:
                 self.rejected += 1
                 continue
-            yield seq, frame, 1e3 * (time.perf_counter() - start)
+            yield seq, frame, decode_ms
 
     def _process(self, seq: int, frame: Frame, decode_ms: float) -> Processed:
         seen = frame if self._masks_given else replace(frame, given_mask=None)
@@ -148,6 +145,37 @@ class Pipeline:
             iou = 0.0 if step.detection is None else overlap(step.detection.mask, silhouette)
         stage_ms = {name: stage_ms.get(name, 0.0) for name in STAGE_NAMES}
         return Processed(frame, step, latency_ms, decode_ms, stage_ms, resident_mib(), iou)
+
+
+class _ReadAhead:
+    """Reads and decodes the next frame in a thread while earlier ones are processed: each with its decoding time, ms.
+
+    A recording is read by one thread from beginning to end, as SQLite demands.
+    """
+
+    def __init__(self, frames: Iterable[Frame | FrameError]) -> None:
+        self._frames = iter(frames)
+        self._thread = ThreadPoolExecutor(1, "read")
+        self._next = self._thread.submit(self._read)
+
+    def __iter__(self) -> Iterator[tuple[Frame | FrameError, float]]:
+        while True:
+            frame, decode_ms = self._next.result()
+            if frame is None:
+                return
+            self._next = self._thread.submit(self._read)
+            yield frame, decode_ms
+
+    def close(self) -> None:
+        """End the reading."""
+        if isinstance(self._frames, Generator):
+            self._thread.submit(self._frames.close)
+        self._thread.shutdown()
+
+    def _read(self) -> tuple[Frame | FrameError | None, float]:
+        start = time.perf_counter()
+        frame = next(self._frames, None)
+        return frame, 1e3 * (time.perf_counter() - start)
 
 
 class _Clock:

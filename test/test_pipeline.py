@@ -1,5 +1,7 @@
 """The in-process pipeline: admission, masks, timing; independent of any backend."""
 
+import threading
+
 import numpy as np
 import pytest
 from scripted import CAMERA, ScriptedMethod, frame, mask, stamp
@@ -59,6 +61,30 @@ def test_recorded_masks_reach_the_method_only_when_given():
 def test_box_masks_are_no_silhouette_to_judge_by():
     done, _, _ = run([frame(0, np.full((48, 64), 128, np.uint8))])
     assert np.isnan(done[0].mask_iou)
+
+
+def test_frames_are_read_by_one_thread_and_an_error_of_reading_ends_the_run():
+    threads = set()
+
+    def recording():
+        try:
+            for i in range(3):
+                threads.add(threading.get_ident())
+                yield frame(i)
+            raise BagError("breaks off")
+        finally:
+            threads.add(threading.get_ident())
+
+    done = []
+    with pytest.raises(BagError, match="breaks off"):
+        done.extend(Pipeline(ScriptedMethod(), masks_given=False).run(recording()))
+    assert len(threads) == 1
+    threads.clear()
+    abandoned = Pipeline(ScriptedMethod(), masks_given=False).run(recording())
+    next(abandoned)
+    abandoned.close()
+    assert len(threads) == 1, "closed by the thread that read it"
+    assert threading.get_ident() not in threads
 
 
 def row(**values):
