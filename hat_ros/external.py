@@ -30,10 +30,9 @@ from hat_ros.config import HatConfig
 from hat_ros.datasets.image_files import stamp_of
 from hat_ros.errors import InputError, UsageError
 from hat_ros.evaluation.folder import complete_folder
-from hat_ros.evaluation.score import write_json
 from hat_ros.provenance import describe_run, input_hash
 from hat_ros.result_bag import ResultBagWriter
-from hat_ros.results import CONFIG_FILE, RUN_FILE, ResultFolder
+from hat_ros.results import CONFIG_FILE, RUN_FILE, ResultFolder, write_json
 from hat_ros.source import Source, SourceSpec
 from hat_ros.tracker import Step
 from hat_ros.types import Candidates, Estimate, Motion, Selection, TrackState

@@ -1,7 +1,7 @@
 """The result bag: what every stage said about every frame, images excepted, with the truth beside it when known.
 
 ``hat track`` writes it here, frame by frame; ``hat replay`` records the same messages from the graph. Both are read
-back into one :class:`~hat_ros.evaluation.runlog.RunLog`. Bag time is the exposure stamp.
+back into one :class:`~hat_ros.runlog.RunLog`. Bag time is the exposure stamp.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from rosbags.rosbag2 import Reader
 
 from hat_ros.bag import TYPESTORE, BagWriter, check_manifest, deserialize
 from hat_ros.errors import BagError, HatError
-from hat_ros.evaluation.runlog import RunLog, RunLogBuilder
 from hat_ros.nodes import topics, wire
+from hat_ros.runlog import RunLog, RunLogBuilder
 from hat_ros.tracker import Step
 from hat_ros.types import Alignment, Camera, Candidates, Estimate, Motion
 

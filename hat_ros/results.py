@@ -14,40 +14,26 @@ overlay.mp4     the clip with the CAD outline drawn in
 from __future__ import annotations
 
 import csv
+import json
+import math
 import shutil
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import TextIO
+from typing import Any, TextIO
 
 import numpy as np
 import yaml
 
 from hat_ros.config import HatConfig, config_to_dict
 from hat_ros.errors import RunError, UsageError
-from hat_ros.evaluation.metrics import pose_errors
-from hat_ros.evaluation.runlog import RunLog
-from hat_ros.types import Estimate, TrackState
+from hat_ros.types import Estimate
 
 BAG_FOLDER = "bag"
 METRICS_FILE = "metrics.json"
 CONFIG_FILE = "config.yaml"
 RUN_FILE = "run.json"
-
-POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
-CSV_COLUMNS = (
-    "stamp_ns",
-    "state",
-    *POSE_COLUMNS,
-    "keyframe",
-    "n_candidates",
-    "anchor",
-    "gap_frames",
-    "E_t_m",
-    "E_q_deg",
-    "E_p",
-)
 
 
 class ResultFolder:
@@ -112,6 +98,23 @@ def write_config(path: Path, config: HatConfig) -> None:
     (path / CONFIG_FILE).write_text(text, encoding="utf-8")
 
 
+def write_json(path: Path, data: dict[str, Any]) -> None:
+    """Write strict JSON: NaN and infinities become null."""
+    path.write_text(json.dumps(_plain(data), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
 class LiveTables:
     """Pose tables that grow with the run, flushed line by line, so that a stopped run leaves what it knew.
 
@@ -141,37 +144,7 @@ class LiveTables:
         self._stack.close()
 
 
-def write_tables(path: Path, log: RunLog) -> None:
-    """``poses.tum`` and ``poses.csv`` of a finished run."""
-    errors = pose_errors(log.T_est, log.T_true)
-    with (path / "poses.tum").open("w", encoding="utf-8", newline="") as tum:
-        for i in np.flatnonzero(log.has_output):
-            tum.write(tum_line(int(log.stamp_ns[i]), log.pose_rows[i]))
-    with (path / "poses.csv").open("w", encoding="utf-8", newline="") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(CSV_COLUMNS)
-        for i in range(len(log)):
-            pose = log.pose_rows[i] if log.has_output[i] else np.full(7, np.nan)
-            table.writerow(
-                (
-                    int(log.stamp_ns[i]),
-                    TrackState(int(log.state[i])).name,
-                    *_cells(pose),
-                    int(log.keyframe[i]),
-                    len(log.candidates[i]),
-                    int(log.anchor[i]),
-                    int(log.gap_frames[i]),
-                    *_cells((errors.translation_m[i], np.degrees(errors.rotation_rad[i]), errors.pose[i])),
-                )
-            )
-
-
 def tum_line(stamp_ns: int, pose_row: np.ndarray) -> str:
     """One line of a TUM trajectory: seconds to the nanosecond, then the pose in full precision."""
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
     return f"{seconds}.{nanoseconds:09d} " + " ".join(repr(float(value)) for value in pose_row) + "\n"
-
-
-def _cells(values: Iterable[float]) -> list[str]:
-    """Numbers in full precision, an empty cell for NaN."""
-    return ["" if np.isnan(value) else repr(float(value)) for value in values]

@@ -17,12 +17,11 @@ from hat_ros.config import HatConfig
 from hat_ros.errors import HatError, MissingDependencyError, RunError, UsageError
 from hat_ros.evaluation.folder import complete_folder
 from hat_ros.evaluation.metrics import mask_summary
-from hat_ros.evaluation.score import write_json
 from hat_ros.methods import create_method
 from hat_ros.pipeline import MEASURED, WARMUP_FRAMES, Pipeline, latency_summary, memory_summary
 from hat_ros.provenance import describe_run
 from hat_ros.result_bag import ResultBagWriter
-from hat_ros.results import RUN_FILE, LiveTables, ResultFolder, write_config
+from hat_ros.results import RUN_FILE, LiveTables, ResultFolder, write_config, write_json
 from hat_ros.source import Source, SourceSpec
 from hat_ros.tracker import Step
 from hat_ros.types import TrackState

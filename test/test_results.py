@@ -9,9 +9,10 @@ from scripted import CAMERA, stamp, steps, true_row, truth
 
 from hat_ros.config import HatConfig, config_from_dict
 from hat_ros.errors import BagError, UsageError
-from hat_ros.evaluation.runlog import RunLogBuilder
+from hat_ros.evaluation.pose_tables import write_tables
 from hat_ros.result_bag import ResultBagWriter, read_result_bag
-from hat_ros.results import LiveTables, ResultFolder, tum_line, write_config, write_tables
+from hat_ros.results import LiveTables, ResultFolder, tum_line, write_config
+from hat_ros.runlog import RunLogBuilder
 from hat_ros.types import TrackState
 
 

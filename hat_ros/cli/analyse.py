@@ -308,7 +308,7 @@ def _ablate(arguments: argparse.Namespace) -> int:
     from hat_ros.evaluation.ablate_figure import table_figure
     from hat_ros.evaluation.campaign import run_campaign
     from hat_ros.evaluation.figures import image_bytes
-    from hat_ros.evaluation.score import write_json
+    from hat_ros.results import write_json
 
     out = arguments.out.resolve()
     clips = [spec for spec, _ in _clips(arguments)]

@@ -121,7 +121,7 @@ def _profile(arguments: argparse.Namespace) -> int:
     limit_threads(arguments.threads)
     from hat_ros.cli.console import state_progress
     from hat_ros.evaluation.profile import profile
-    from hat_ros.evaluation.score import write_json
+    from hat_ros.results import write_json
 
     source = spec_of(arguments).open()
     with state_progress("profiling", arguments.quiet) as watch:

@@ -9,7 +9,7 @@ the two is wrong; hindsight can, so an anchor that does not fit the others count
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,8 @@ from hat_ros.types import Candidates, Float, Motion
 
 # Random rotations agree within 75 degrees one time in nine, so motion that fits nothing links a fifth of the anchors.
 _CREDIBLE_SHARE = 1.0 / 3.0
+# A pose measured on one image and a step between two images count the same.
+_DENSE_STEP_WEIGHT = 1.0
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,32 @@ def solve_offline(candidates: Sequence[Candidates], motions: Sequence[Motion], c
             graph.add_pose(frame, anchor)
             graph.add_anchor(frame, anchor, weight)
     return OfflineResult(_hold(graph.solve()), chosen, gate_weight)
+
+
+def smooth_measured(T_measured: Float, motions: Sequence[Motion], config: HatConfig) -> Float:
+    """The joint optimum of poses measured on (nearly) every image and the motion between them.
+
+    The error of a measured pose jitters from frame to frame, that of the motion grows slowly; each step counts as much
+    as a measurement, so that a pose is in effect the mean over a few frames on either side.
+
+    Args:
+        T_measured: (N, 4, 4) ``T_cam_target``, NaN at frames that were not measured.
+        motions: per frame.
+        config: loss and lever of the residuals, rules of the alignment.
+
+    Returns:
+        (N, 4, 4) poses; NaN at frames that no motion connects to a measured one.
+    """
+    fusion = replace(config.fusion, relative_weight=_DENSE_STEP_WEIGHT)
+    graph = PoseGraph(len(motions), fusion, config.alignment.lever_m_per_rad)
+    measured = {int(i): T_measured[i] for i in np.flatnonzero(np.isfinite(T_measured).all(axis=(1, 2)))}
+    for epoch in sorted({motion.epoch for motion in motions if motion.valid}):
+        here = {i: T for i, T in measured.items() if motions[i].valid and motions[i].epoch == epoch}
+        _add_epoch(graph, motions, epoch, here, config)
+    for frame, T in measured.items():
+        graph.add_pose(frame, T)
+        graph.add_anchor(frame, T, 1.0)
+    return graph.solve()
 
 
 def consistent(anchors: Sequence[Float], motions: Sequence[Motion], config: HatConfig) -> NDArray[np.bool_]:

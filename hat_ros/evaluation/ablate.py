@@ -18,12 +18,12 @@ from hat_ros.errors import RunError, UsageError
 from hat_ros.evaluation import metrics
 from hat_ros.evaluation.campaign import Job, Outcome
 from hat_ros.evaluation.filters import FilterNoise, ParticleSelector, UkfSelector
-from hat_ros.evaluation.runlog import RunLog
 from hat_ros.evaluation.tables import Column, Table
 from hat_ros.evaluation.temporal_replay import replay_offline, replay_temporal
 from hat_ros.provenance import code_hash
 from hat_ros.result_bag import read_result_bag
 from hat_ros.results import BAG_FOLDER, CONFIG_FILE, write_config
+from hat_ros.runlog import RunLog
 from hat_ros.source import SourceSpec
 
 # No rotation disagrees by more: the gate is off.

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from hat_ros import lie
 from hat_ros.evaluation import metrics
-from hat_ros.evaluation.runlog import RunLog
+from hat_ros.runlog import RunLog
 from hat_ros.types import TrackState
 
 STATE_COLOR = {

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from hat_ros.errors import BagError, HatError, RunError, UsageError
 from hat_ros.evaluation.figures import error_figure, image_bytes, range_figure
-from hat_ros.evaluation.overlay import OverlayPainter, VideoFile
+from hat_ros.evaluation.pose_tables import write_tables
 from hat_ros.evaluation.report import write_report
-from hat_ros.evaluation.runlog import RunLog
-from hat_ros.evaluation.score import score_run, write_json
+from hat_ros.evaluation.score import score_run
 from hat_ros.evaluation.temporal_replay import save_observations
+from hat_ros.overlay import OverlayPainter, VideoFile
 from hat_ros.result_bag import read_result_bag
-from hat_ros.results import BAG_FOLDER, CONFIG_FILE, METRICS_FILE, RUN_FILE, write_tables
+from hat_ros.results import BAG_FOLDER, CONFIG_FILE, METRICS_FILE, RUN_FILE, write_json
+from hat_ros.runlog import RunLog
 from hat_ros.source import Source, SourceSpec, open_source
 from hat_ros.types import Frame, TrackState
 

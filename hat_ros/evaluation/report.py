@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hat_ros.evaluation import figures
-from hat_ros.evaluation.runlog import RunLog
+from hat_ros.runlog import RunLog
 
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 1080px; margin: 2em auto; padding: 0 1em; color: #1c2733; }

@@ -1,16 +1,13 @@
-"""From a run to ``metrics.json``."""
+"""The figures of ``metrics.json``, from a run and its truth."""
 
 from __future__ import annotations
 
-import json
-import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hat_ros.evaluation import metrics
-from hat_ros.evaluation.runlog import RunLog
+from hat_ros.runlog import RunLog
 from hat_ros.target import Target
 from hat_ros.types import TrackState
 
@@ -70,20 +67,3 @@ def surface_points(target: Target, count: int = ADD_S_POINTS) -> metrics.Float:
     a[flip], b[flip] = 1 - a[flip], 1 - b[flip]
     origin = corners[face, 0]
     return origin + a[:, None] * (corners[face, 1] - origin) + b[:, None] * (corners[face, 2] - origin)
-
-
-def write_json(path: Path, data: dict[str, Any]) -> None:
-    """Write strict JSON: NaN and infinities become null."""
-    path.write_text(json.dumps(_plain(data), indent=2, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

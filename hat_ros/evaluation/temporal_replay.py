@@ -17,7 +17,7 @@ from hat_ros.core.fusion import FusionStage
 from hat_ros.core.keyframes import KeyframeSchedule
 from hat_ros.core.offline import solve_offline
 from hat_ros.core.selector import SelectorStage, box_area_px
-from hat_ros.evaluation.runlog import RunLog, RunLogBuilder
+from hat_ros.runlog import RunLog, RunLogBuilder
 from hat_ros.temporal import Observations
 from hat_ros.types import Camera, Candidates, Estimate, Frame, Motion, Selection, TrackState
 

@@ -11,8 +11,8 @@ from typing import Any, ClassVar
 import cv2
 import numpy as np
 
-from hat_ros.evaluation.overlay import OverlayPainter
 from hat_ros.nodes import base, process, qos, topics, wire
+from hat_ros.overlay import OverlayPainter
 from hat_ros.types import Camera
 
 # Images that may wait for their status; more than the frames in flight.

@@ -9,7 +9,7 @@ from temporal_scene import HALF_TURN, make_scene, preset, rotation_error_deg
 
 from hat_ros import lie
 from hat_ros.config import FusionConfig, SelectorConfig
-from hat_ros.core.offline import backtrace, consistent, solve_offline
+from hat_ros.core.offline import backtrace, consistent, smooth_measured, solve_offline
 from hat_ros.core.pose_graph import PoseGraph
 from hat_ros.core.selector import motion_penalty, scaled_score
 from hat_ros.temporal import run_temporal
@@ -204,3 +204,47 @@ class TestPoseGraph:
         out = graph.solve()
         np.testing.assert_allclose(out[1], T, atol=1e-9)
         assert np.isnan(out[[0, 2]]).all()
+
+
+class TestSmoothMeasured:
+    CONFIG = preset("pico_hat")
+
+    @staticmethod
+    def _noisy(scene, sigma_deg=0.5, sigma_m=0.02, seed=0):
+        rng = np.random.default_rng(seed)
+        T = scene.T_cam_target.copy()
+        T[:, :3, :3] = lie.so3_exp(np.radians(sigma_deg) * rng.normal(size=(len(T), 3))) @ T[:, :3, :3]
+        T[:, :3, 3] += sigma_m * rng.normal(size=(len(T), 3))
+        return T
+
+    def test_motion_quietens_what_jitters(self):
+        scene = make_scene(120, rate_deg=3)
+        measured = self._noisy(scene)
+        smooth = smooth_measured(measured, _recorded(scene)[1], self.CONFIG)
+        before = rotation_error_deg(measured, scene.T_cam_target).mean()
+        assert rotation_error_deg(smooth, scene.T_cam_target).mean() < 0.8 * before
+        shift_m = np.linalg.norm(smooth[:, :3, 3] - scene.T_cam_target[:, :3, 3], axis=1)
+        assert shift_m.mean() < 0.8 * np.linalg.norm(measured[:, :3, 3] - scene.T_cam_target[:, :3, 3], axis=1).mean()
+
+    def test_motion_that_drifts_pulls_no_measurement_away(self):
+        scene = make_scene(120, rate_deg=3, gauge=np.eye(4))
+        motions = _tumbling_motion(scene, drift_deg=0.3)
+        smooth = smooth_measured(scene.T_cam_target, motions, self.CONFIG)
+        assert rotation_error_deg(smooth, scene.T_cam_target).max() < 0.3
+
+    def test_motion_bridges_frames_that_were_not_measured(self):
+        scene = make_scene(90, rate_deg=3)
+        measured = scene.T_cam_target.copy()
+        measured[40:50] = np.nan
+        smooth = smooth_measured(measured, _recorded(scene)[1], self.CONFIG)
+        assert rotation_error_deg(smooth, scene.T_cam_target).max() < 0.5
+
+    def test_what_nothing_reaches_stays_unknown(self):
+        scene = make_scene(30)
+        motions = [Motion.none()] * 30
+        measured = np.full((30, 4, 4), np.nan)
+        assert np.isnan(smooth_measured(measured, motions, self.CONFIG)).all()
+        measured[7] = scene.T_cam_target[7]
+        smooth = smooth_measured(measured, motions, self.CONFIG)
+        np.testing.assert_allclose(smooth[7], measured[7], atol=1e-9)
+        assert np.isnan(np.delete(smooth, 7, axis=0)).all()

@@ -13,7 +13,6 @@ from hat_ros.evaluation import ablate
 from hat_ros.evaluation.ablate_figure import table_figure
 from hat_ros.evaluation.figures import image_bytes
 from hat_ros.evaluation.filters import FilterNoise, ParticleSelector, UkfSelector
-from hat_ros.evaluation.runlog import RunLogBuilder
 from hat_ros.evaluation.tables import Table
 from hat_ros.evaluation.temporal_replay import (
     keyframes_of,
@@ -22,6 +21,7 @@ from hat_ros.evaluation.temporal_replay import (
     replay_temporal,
     save_observations,
 )
+from hat_ros.runlog import RunLogBuilder
 from hat_ros.source import SourceSpec
 from hat_ros.temporal import load_observations, run_temporal
 from hat_ros.types import Candidates, Estimate, Motion, TrackState

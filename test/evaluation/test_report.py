@@ -9,8 +9,9 @@ from scripted import steps, truth
 
 from hat_ros.evaluation.figures import error_figure, image_bytes
 from hat_ros.evaluation.report import write_report
-from hat_ros.evaluation.runlog import RunLogBuilder
-from hat_ros.evaluation.score import score_run, write_json
+from hat_ros.evaluation.score import score_run
+from hat_ros.results import write_json
+from hat_ros.runlog import RunLogBuilder
 
 
 def log_of(true=True):

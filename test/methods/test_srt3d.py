@@ -5,8 +5,8 @@ import pytest
 
 from hat_ros import lie
 from hat_ros.datasets.models import build_target
-from hat_ros.evaluation import srt3d
-from hat_ros.evaluation.srt3d import ColorHistograms, RegionTracker
+from hat_ros.methods import srt3d
+from hat_ros.methods.srt3d import ColorHistograms, RegionTracker
 from hat_ros.render import create_renderer
 from hat_ros.types import Camera, Frame
 

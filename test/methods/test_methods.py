@@ -135,6 +135,12 @@ def test_offline_refines_on_the_images_where_the_configuration_does(frames, targ
     assert all(np.isfinite(e.covariance).all() for e in final), "a refined pose knows its uncertainty"
 
 
+def test_hindsight_loses_to_the_causal_pose_nowhere_that_matters(frames, target):
+    steps, method = run("offline", frames, target, refinement={"enabled": True})
+    causal_deg, offline_deg = errors_deg([step.estimate for step in steps]), errors_deg(method.finish())
+    assert offline_deg.mean() <= causal_deg.mean()
+
+
 def test_offline_of_nothing_is_nothing(target):
     _, method = run("offline", [], target)
     assert method.finish() == []

@@ -1,0 +1,138 @@
+"""The offline reference: what hindsight makes of the observations of HAT. Never causal.
+
+After the paper's "Causal and Offline Performance Comparison": the decoder's path traced back, one verdict of the gate
+over the whole sequence, all poses optimised jointly, then dense refinement of every frame, which never leaves the basin
+of the anchors. Here the refined poses are measurements, as they are for the causal method: a last joint optimisation
+ties them to each other by the motion. Without refinement in the configuration the poses of the anchors stand.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from hat_ros import lie
+from hat_ros.config import HatConfig
+from hat_ros.core.offline import smooth_measured, solve_offline
+from hat_ros.core.refined import is_supported, quality
+from hat_ros.methods.causal import Hat
+from hat_ros.refinement import create_refiner
+from hat_ros.target import Target
+from hat_ros.tracker import Step
+from hat_ros.types import Camera, Detection, Estimate, Float, Frame, Refined, TrackState
+
+# The paper's dense refinement rejects what lies further than this from the anchors.
+_SAME_BASIN_DEG = 90.0
+_NO_COVARIANCE = np.full((6, 6), np.nan)
+
+
+class Offline:
+    """HAT's stages frame by frame, and the answer to all frames at the end."""
+
+    causal = False
+    concurrent = False
+
+    def __init__(self, config: HatConfig, target: Target) -> None:
+        self._config = config
+        self._hat = Hat(config, target)
+        self._refiner = create_refiner(config, target)
+        self._steps: list[Step] = []
+        self._images: list[_StoredImage] = []
+        self.stages = self._hat.stages
+
+    def step(self, frame: Frame) -> Step:
+        """Observe; the estimate in the returned step is the causal one."""
+        step = self._hat.step(frame)
+        self._steps.append(replace(step, detection=None))
+        if self._refiner is not None:
+            self._images.append(_StoredImage.of(frame, step.detection))
+        return step
+
+    def finish(self) -> list[Estimate]:
+        """Decode, align, optimise jointly; refine on the images, and optimise again."""
+        steps = self._steps
+        if not steps:
+            return []
+        motions = [step.motion for step in steps]
+        result = solve_offline([step.candidates for step in steps], motions, self._config)
+        T_final, covariances = result.T_cam_target, [_NO_COVARIANCE] * len(steps)
+        if self._refiner is not None:
+            measured = [self._measured(index, T) for index, T in enumerate(T_final)]
+            covariances = [covariance for _, covariance in measured]
+            smooth = smooth_measured(np.stack([T for T, _ in measured]), motions, self._config)
+            T_final = np.where(np.isfinite(smooth), smooth, T_final)
+        estimates = []
+        for index, (step, T, covariance) in enumerate(zip(steps, T_final, covariances, strict=True)):
+            known = bool(np.isfinite(T).all())
+            estimates.append(
+                replace(
+                    step.estimate,
+                    state=TrackState.TRACKING if known else TrackState.LOST,
+                    pose_row=lie.row_from_matrix(T) if known else np.full(7, np.nan),
+                    covariance=covariance,
+                    anchor=int(result.chosen[index]),
+                    gate_weight=float(result.gate_weight[index]),
+                    gap_frames=0,
+                )
+            )
+        return estimates
+
+    def _measured(self, index: int, T_decided: Float) -> tuple[Float, Float]:
+        """The pose (4, 4) that the image of a frame supports near the decided one, and its covariance; NaN: none.
+
+        What the causal method measured in the decided basin stands: it began closer, at the frame before.
+        """
+        nothing = np.full((4, 4), np.nan), _NO_COVARIANCE
+        if not np.isfinite(T_decided).all():
+            return nothing
+        causal, config = self._steps[index].estimate, self._config.refinement
+        T_causal = causal.T_cam_target if causal.state.has_pose else None
+        was_measured = T_causal is not None and causal.gap_frames == 0
+        if was_measured and _apart_deg(T_causal, T_decided) <= config.same_pose_deg:
+            return T_causal, causal.covariance
+        best = self._refined(index, T_decided)
+        T_known = T_decided if best is None else best.T_cam_target
+        if T_causal is not None:
+            apart_deg = _apart_deg(T_causal, T_known)
+            if was_measured and apart_deg <= config.same_pose_deg:
+                return T_causal, causal.covariance
+            if config.same_pose_deg < apart_deg < _SAME_BASIN_DEG:
+                other = self._refined(index, T_causal)
+                if quality(other) > quality(best) + (config.switch_margin if is_supported(best, config) else 0.0):
+                    best = other
+        return (best.T_cam_target, best.covariance) if is_supported(best, config) else nothing
+
+    def _refined(self, index: int, T_cam_target: Float) -> Refined | None:
+        frame, detection = self._images[index].load()
+        return self._refiner.refine(frame, detection, T_cam_target)
+
+
+def _apart_deg(T_a: Float, T_b: Float) -> float:
+    return float(np.degrees(lie.angle_between(T_a[:3, :3], T_b[:3, :3])))
+
+
+@dataclass(frozen=True)
+class _StoredImage:
+    """A frame and its detection, compressed without loss."""
+
+    stamp_ns: int
+    camera: Camera
+    png: np.ndarray
+    mask_bits: np.ndarray | None
+    silhouette: bool
+
+    @classmethod
+    def of(cls, frame: Frame, detection: Detection | None) -> _StoredImage:
+        png = cv2.imencode(".png", frame.rgb, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+        bits = None if detection is None else np.packbits(detection.mask)
+        return cls(frame.stamp_ns, frame.camera, png, bits, detection is not None and detection.silhouette)
+
+    def load(self) -> tuple[Frame, Detection | None]:
+        frame = Frame(self.stamp_ns, cv2.imdecode(self.png, cv2.IMREAD_COLOR), self.camera)
+        if self.mask_bits is None:
+            return frame, None
+        shape = (self.camera.height, self.camera.width)
+        mask = np.unpackbits(self.mask_bits, count=shape[0] * shape[1]).reshape(shape).astype(bool)
+        return frame, Detection(mask, self.silhouette)
