@@ -235,7 +235,10 @@ def _run(
                     steps.append(done.step)
                 if watch is not None:
                     watch(len(rows), total, done.step.estimate.state)
-            for step, row in zip(pipeline.finish(steps), rows[: len(steps)], strict=True):
+            last_answer_s = time.perf_counter()
+            final = pipeline.finish(steps)
+            finish_s = time.perf_counter() - last_answer_s
+            for step, row in zip(final, rows[: len(steps)], strict=True):
                 tables.add(step.estimate, row)
                 bag.write_step(step, pipeline.rejected)
         finally:
@@ -244,4 +247,5 @@ def _run(
         raise RunError(f"no frame of {source.path} could be used, {pipeline.rejected} were rejected (stamp or image)")
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     overlap = np.array([row[MEASURED.index("mask_iou")] for row in rows])
-    return latency_summary(rows) | mask_summary(overlap) | {"peak_memory_mib": peak_mib} | memory_summary(rows)
+    speed, memory = latency_summary(rows, finish_s), {"peak_memory_mib": peak_mib} | memory_summary(rows)
+    return speed | memory | mask_summary(overlap)

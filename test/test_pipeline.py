@@ -100,6 +100,12 @@ def test_speed_is_by_the_clock_on_the_wall_and_leaves_out_warm_up():
     assert summary["motion_ms_mean"] == pytest.approx(3.0)
 
 
+def test_what_hindsight_computes_after_the_last_frame_counts():
+    row = tuple({"period_ms": 100.0}.get(name, 1.0) for name in MEASURED)
+    assert latency_summary([row] * (WARMUP_FRAMES + 10))["fps"] == pytest.approx(10.0)
+    assert latency_summary([row] * (WARMUP_FRAMES + 10), finish_s=1.0)["fps"] == pytest.approx(5.0)
+
+
 def test_memory_growth_compares_quarters():
     rows = [row(rss_mib=100.0 + (i >= 60) * 5.0) for i in range(80)]
     assert memory_summary(rows)["memory_growth_mib"] == pytest.approx(5.0)

@@ -120,7 +120,7 @@ def _add_profile(commands: Commands) -> None:
 def _profile(arguments: argparse.Namespace) -> int:
     limit_threads(arguments.threads)
     from hat_ros.cli.console import state_progress
-    from hat_ros.evaluation.profile import profile
+    from hat_ros.profiler import profile
     from hat_ros.results import write_json
 
     source = spec_of(arguments).open()

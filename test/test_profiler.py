@@ -11,7 +11,7 @@ from hat_ros.config import load_config
 from hat_ros.datasets.suite import Clip, synthesize
 from hat_ros.datasets.synth import ClipSpec
 from hat_ros.errors import MissingDependencyError, UsageError
-from hat_ros.evaluation.profile import PARTS, Meter, Part, parts_of, profile
+from hat_ros.profiler import PARTS, Meter, Part, parts_of, profile
 from hat_ros.segmentation.stage import SegmentationStage
 from hat_ros.source import open_source
 
