@@ -1,50 +1,33 @@
 """``hat ablate``: the paper's component table, sensitivity sweeps, filters and offline reference, on any clips.
 
-The front ends run once per clip (``--mode observe``, candidates at every frame); every row below re-runs Stages 3 and
-4 alone over those observations. Errors are pooled over all frames of all clips, as the paper pools a data set.
+The front ends run once per clip (``--mode observe``, candidates at every frame); every row re-runs Stages 3 and 4 alone
+over those observations. Errors are pooled over all frames of all clips, as the paper pools a data set. Two more runs per
+clip stand beside them: one whose motion sees masked frames where the first one's sees raw ones, or the other way round,
+and one of the tracking baseline.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hat_ros.config import HatConfig, flat_options, load_config
+from hat_ros import lie
+from hat_ros.config import HatConfig, load_config
 from hat_ros.errors import RunError, UsageError
 from hat_ros.evaluation import metrics
+from hat_ros.evaluation.ablate_rows import Row, table_rows
 from hat_ros.evaluation.campaign import Job, Outcome
-from hat_ros.evaluation.filters import FilterNoise, ParticleSelector, UkfSelector
 from hat_ros.evaluation.tables import Column, Table
-from hat_ros.evaluation.temporal_replay import replay_offline, replay_temporal
+from hat_ros.evaluation.temporal_replay import replay_temporal
 from hat_ros.provenance import code_hash
 from hat_ros.result_bag import read_result_bag
 from hat_ros.results import BAG_FOLDER, CONFIG_FILE, write_config
 from hat_ros.runlog import RunLog
 from hat_ros.source import SourceSpec
-
-# No rotation disagrees by more: the gate is off.
-GATE_OFF_DEG = 180.0
-STRIDES = (5, 10, 20, 40)
-CANDIDATE_COUNTS = (5, 10)
-SIZE_REFERENCES_PX = (300.0, 400.0, 500.0, 600.0)
-GATE_ANGLES_DEG = (45.0, 75.0, 120.0, GATE_OFF_DEG)
-RELATIVE_WEIGHTS = (0.05, 0.1, 0.25, 0.5)
-FILTER_MOTION_DEG = (1.0, 3.0, 10.0)
-FILTER_CANDIDATE_DEG = (3.0, 10.0, 30.0)
-
-# kind, mode, settings of the runs that everything else is made from.
-_RUNS = (
-    ("masked", "observe", ("slam.masked=true",)),
-    ("unmasked", "observe", ("slam.masked=false",)),
-    ("tracking", "tracking", ()),
-)
-
-# What may stand in Stage 3's place.
-_SELECTORS = {"viterbi": None, "particles": ParticleSelector, "ukf": UkfSelector}
 
 _ERRORS = (
     Column("E_t_m_mean", "E_t m", ".4f", r"$E_t$ (m)"),
@@ -59,44 +42,31 @@ _ANCHORS = (
     Column("anchor_over_90_share", "anchor >90", ".2%"),
     Column("anchors", "anchors", "d"),
 )
-
-
 _COLUMNS = (Column("name", "configuration"), *_ERRORS, *_ANCHORS)
-_BEST_APPEARANCE = {"motion_weight_per_deg": 0.0, "running_gate": False}
+_ORACLE = (
+    Column("clip", "clip"),
+    Column("oracle_keyframes", "images", "d"),
+    Column("oracle_median_deg", "best of K, median deg", ".2f"),
+    Column("oracle_within_15_share", "best<15", ".1%"),
+    Column("oracle_within_30_share", "best<30", ".1%"),
+    Column("E_q_over_90_share", "first >90", ".1%"),
+)
+_RANGES = (
+    Column("depth_from_m", "depth from m", ".0f"),
+    Column("depth_to_m", "to m", ".0f"),
+    Column("frames", "frames", "d"),
+    Column("rotation_deg_q25", "E_q deg, 25 %", ".2f"),
+    Column("rotation_deg_median", "median", ".2f"),
+    Column("rotation_deg_q75", "75 %", ".2f"),
+    Column("depth_m_q25", "depth error m, 25 %", ".4f"),
+    Column("depth_m_median", "median", ".4f"),
+    Column("depth_m_q75", "75 %", ".4f"),
+    Column("over_90_share", ">90", ".1%"),
+    Column("depth_energy_share", "depth's share of E_t^2", ".1%"),
+)
 
-
-@dataclass(frozen=True)
-class Row:
-    """One line of a table: what it is called, and what runs over the observations of a clip.
-
-    Attributes:
-        name: for people.
-        config: temporal settings.
-        offline: the offline reference, else the causal stages.
-        selector: ``viterbi``, ``particles`` or ``ukf``.
-        noise: of a filter; None for the decoder.
-    """
-
-    name: str
-    config: HatConfig
-    offline: bool = False
-    selector: str = "viterbi"
-    noise: FilterNoise | None = None
-
-    def replay(self, log: RunLog) -> RunLog:
-        """The row's answer to one clip."""
-        if self.offline:
-            return replay_offline(log, self.config)
-        stand_in = _SELECTORS[self.selector]
-        return replay_temporal(log, self.config, stand_in and stand_in(self.config.selector, self.noise))
-
-    def settings(self, base: HatConfig) -> dict[str, Any]:
-        """What differs from the configuration of the campaign, and what ran."""
-        usual = {key: value for key, (value, _) in flat_options(base).items()}
-        changed = {key: v for key, (v, _) in flat_options(self.config).items() if v != usual[key]}
-        noise = None if self.noise is None else asdict(self.noise)
-        ran = {"offline": self.offline, "selector": self.selector, "noise": noise}
-        return {"name": self.name, **ran, "settings": changed}
+# Runs per clip, by what they are for.
+OBSERVED, MASKED_OTHERWISE, TRACKING = "observed", "masked-otherwise", "tracking"
 
 
 @dataclass(frozen=True)
@@ -105,7 +75,8 @@ class Plan:
 
     Attributes:
         config: temporal settings and front ends, merged.
-        jobs: the runs that everything else is made from; their label ``kind`` says which.
+        jobs: the runs that everything else is made from; their label ``kind`` says which, ``masked`` whether motion
+            saw the target alone.
     """
 
     config: HatConfig
@@ -113,7 +84,7 @@ class Plan:
 
 
 def plan(
-    clips: Sequence[SourceSpec],
+    clips: Sequence[tuple[SourceSpec, tuple[str, ...]]],
     out: Path,
     config: str,
     front_end: str | None = None,
@@ -123,7 +94,7 @@ def plan(
     """Merge the configurations, write the result to ``out/config.yaml``, and list the runs of the front ends.
 
     Args:
-        clips: recordings with truth.
+        clips: recordings with truth, each with settings of its own for the front ends.
         out: campaign folder.
         config: preset or file of the temporal settings.
         front_end: preset or file of segmentation, hypotheses and motion, and of what belongs to its scores
@@ -151,7 +122,7 @@ def plan(
                 merged.selector, score_scale=front.selector.score_scale, running_gate=front.selector.running_gate
             ),
         )
-    if len({spec.name for spec in clips}) < len(clips):
+    if len({spec.name for spec, _ in clips}) < len(clips):
         raise UsageError("two recordings have the same name: rename one of them")
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -170,54 +141,58 @@ def plan(
         )
     except OSError as error:
         raise RunError(f"cannot write {out}: {error.strerror}") from None
-    jobs = []
-    for spec in clips:
-        for kind, mode, settings in _RUNS:
-            labels = {"clip": spec.name, "kind": kind}
-            config_file = str(out / "front_end" / CONFIG_FILE)
-            jobs.append(Job(f"{spec.name}-{kind}", spec, mode, config_file, settings, 0, limit, labels))
+    jobs = [job for clip in clips for job in _front_end_jobs(*clip, str(out / "front_end" / CONFIG_FILE), limit)]
     return Plan(merged, jobs)
+
+
+def _front_end_jobs(spec: SourceSpec, settings: tuple[str, ...], config_file: str, limit: int | None) -> list[Job]:
+    masked = load_config(config_file, settings).slam.masked
+    otherwise = (*settings, f"slam.masked={str(not masked).lower()}")
+    kinds = (
+        (OBSERVED, "observe", settings, masked),
+        (MASKED_OTHERWISE, "observe", otherwise, not masked),
+        (TRACKING, "tracking", settings, masked),
+    )
+    jobs = []
+    for kind, mode, overrides, is_masked in kinds:
+        labels = {"clip": spec.name, "kind": kind, "masked": str(is_masked).lower()}
+        jobs.append(Job(f"{spec.name}-{kind}", spec, mode, config_file, overrides, 0, limit, labels))
+    return jobs
 
 
 def tables(plan: Plan, outcomes: Sequence[Outcome]) -> dict[str, Table]:
     """All tables, by file name; clips whose runs failed are left out."""
-    logs: dict[str, list[RunLog]] = {kind: [] for kind, _, _ in _RUNS}
-    clips = []
     broken = {outcome.job.labels["clip"] for outcome in outcomes if outcome.figures is None}
+    logs: dict[str, dict[str, RunLog]] = {}
+    by_mask: dict[str, list[RunLog]] = {"true": [], "false": []}
     for outcome in outcomes:
-        if outcome.job.labels["clip"] not in broken:
-            logs[outcome.job.labels["kind"]].append(read_result_bag(outcome.folder / BAG_FOLDER))
-            clips.append(outcome.job.labels["clip"])
-    masked, config = logs["masked"], plan.config
-    if not masked:
+        labels = outcome.job.labels
+        if labels["clip"] not in broken:
+            log = read_result_bag(outcome.folder / BAG_FOLDER)
+            logs.setdefault(labels["kind"], {})[labels["clip"]] = log
+            if labels["kind"] != TRACKING:
+                by_mask[labels["masked"]].append(log)
+    if not logs:
         return {}
-    rows = table_rows(config)
-    tracking = {"name": "tracking (refine the last pose)", **pooled(logs["tracking"])}
-    components = table_of("Cumulative components, causal throughout", rows["components"], masked)
-    filters = table_of("Search for the best filters", rows["filters"], masked)
+    clips, rows = logs[OBSERVED], table_rows(plan.config)
+    observed = list(clips.values())
+    tracking = {"name": "tracking (refine the last pose)", **pooled(list(logs[TRACKING].values()))}
+    components = table_of("Cumulative components, causal throughout", rows["components"], observed)
+    filters = table_of("Search for the best filters", rows["filters"], observed)
     masks = [
-        {"name": name, **pooled([replay_temporal(log, config) for log in logs[kind]])}
-        for name, kind in (("target masked for motion", "masked"), ("raw frames for motion", "unmasked"))
+        {"name": name, **pooled([replay_temporal(log, plan.config) for log in by_mask[masked]])}
+        for name, masked in (("target masked for motion", "true"), ("raw frames for motion", "false"))
     ]
     return {
         "components": with_change(replace(components, rows=[tracking, *components.rows])),
-        "sensitivity": table_of("Sensitivity, one setting at a time", rows["sensitivity"], masked),
-        "selectors": with_best_filters(table_of("Selection at keyframes", rows["selectors"], masked), filters),
+        "sensitivity": table_of("Sensitivity, one setting at a time", rows["sensitivity"], observed),
+        "selectors": with_best_filters(table_of("Selection at keyframes", rows["selectors"], observed), filters),
         "filters": filters,
-        "offline": table_of("Causal and offline on the same observations", rows["offline"], masked),
-        "by_clip": clip_table(rows["offline"], dict(zip(dict.fromkeys(clips), masked, strict=True))),
+        "offline": table_of("Causal and offline on the same observations", rows["offline"], observed),
+        "by_clip": clip_table(rows["offline"], clips),
         "masks": Table("Background masking of the motion estimate", _COLUMNS, masks),
-    }
-
-
-def table_rows(config: HatConfig) -> dict[str, list[Row]]:
-    """The rows that are made from the masked observations, by table."""
-    return {
-        "components": component_rows(config),
-        "sensitivity": sweep_rows(config),
-        "selectors": selector_rows(config),
-        "filters": filter_rows(config),
-        "offline": reference_rows(config),
+        "candidates": candidate_table(clips),
+        "ranges": range_table(observed),
     }
 
 
@@ -230,77 +205,10 @@ def trace(plan: Plan, outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "config": CONFIG_FILE,
         "runs": {
             kind: [f"runs/{o.job.name}" for o in outcomes if o.job.labels["kind"] == kind and o.figures is not None]
-            for kind, _, _ in _RUNS
+            for kind in (OBSERVED, MASKED_OTHERWISE, TRACKING)
         },
         "rows": {name: [row.settings(plan.config) for row in lines] for name, lines in rows.items()},
     }
-
-
-def component_rows(config: HatConfig) -> list[Row]:
-    """The cumulative component table (paper, Table "Cumulative component ablations"), and the inertial prior.
-
-    The prior weighs as much as relative motion where the configuration has it off.
-    """
-    fusion_only = _with(
-        config,
-        selector={"motion_weight_per_deg": 0.0, "running_gate": False, "size_weighting": False},
-        fusion={"gate_angle_deg": GATE_OFF_DEG, "inertial_weight": 0.0},
-    )
-    viterbi = replace(fusion_only, selector=replace(config.selector, size_weighting=False))
-    sized = replace(viterbi, selector=replace(config.selector, size_weighting=True))
-    gated = _with(sized, fusion={"gate_angle_deg": config.fusion.gate_angle_deg})
-    inertia = config.fusion.inertial_weight or config.fusion.relative_weight
-    return [
-        Row("keyframe anchors + SLAM fusion", fusion_only),
-        Row("+ Viterbi basin selection", viterbi),
-        Row("+ size-weighted unary", sized),
-        Row(f"+ disagreement gate (D = {config.fusion.gate_angle_deg:g} deg)", gated),
-        Row(f"+ inertial prior (v = {inertia:g})", _with(gated, fusion={"inertial_weight": inertia})),
-    ]
-
-
-def sweep_rows(config: HatConfig) -> list[Row]:
-    """The sensitivity sweeps (paper, Sec. "Hyperparameter Sensitivity"): one setting varied at a time."""
-    five = {"max_candidates": 5}
-    rows = [
-        Row(f"stride {gap}, K = 5", _with(config, keyframes={"gap_frames": gap}, hypotheses=five)) for gap in STRIDES
-    ]
-    rows += [Row(f"K = {k}", _with(config, hypotheses={"max_candidates": k})) for k in CANDIDATE_COUNTS]
-    rows += [
-        Row(f"s0 = {s0:g} px", _with(config, selector={"size_weighting": True, "size_ref_px": s0}))
-        for s0 in SIZE_REFERENCES_PX
-    ]
-    rows.append(Row("no size weight", _with(config, selector={"size_weighting": False})))
-    rows += [
-        Row("D off" if angle == GATE_OFF_DEG else f"D = {angle:g} deg", _with(config, fusion={"gate_angle_deg": angle}))
-        for angle in GATE_ANGLES_DEG
-    ]
-    rows += [Row(f"w = {w:g}", _with(config, fusion={"relative_weight": w})) for w in RELATIVE_WEIGHTS]
-    return rows
-
-
-def selector_rows(config: HatConfig) -> list[Row]:
-    """The decoder against what could stand in its place (paper, Sec. "Continuous-State Filters")."""
-    return [
-        Row("best appearance", _with(config, selector=_BEST_APPEARANCE)),
-        Row("forward Viterbi", config),
-        Row("offline backtrace", config, offline=True),
-    ]
-
-
-def filter_rows(config: HatConfig) -> list[Row]:
-    """The particle filter and the UKF under every setting of a search, so that each can show its best."""
-    return [
-        Row(
-            f"{title}, motion {motion_deg:g} deg, candidates {candidate_deg:g} deg",
-            config,
-            selector=selector,
-            noise=FilterNoise(motion_deg=motion_deg, candidate_deg=candidate_deg),
-        )
-        for selector, title in (("particles", "particle filter on SO(3)"), ("ukf", "UKF"))
-        for motion_deg in FILTER_MOTION_DEG
-        for candidate_deg in FILTER_CANDIDATE_DEG
-    ]
 
 
 def with_best_filters(selectors: Table, filters: Table) -> Table:
@@ -311,22 +219,6 @@ def with_best_filters(selectors: Table, filters: Table) -> Table:
         if kind not in best or row["anchor_deg_mean"] < best[kind]["anchor_deg_mean"]:
             best[kind] = row
     return replace(selectors, rows=[*selectors.rows, *best.values()])
-
-
-def reference_rows(config: HatConfig) -> list[Row]:
-    """Causal against offline on the same observations (paper, Table "Causal and offline HAT").
-
-    Independent poses take candidates at every frame, the others at keyframes; the last two rows take them at every
-    frame as well, so that nothing but the method differs.
-    """
-    every_frame = _with(config, keyframes={"gap_frames": 1})
-    return [
-        Row("independent", _with(every_frame, selector=_BEST_APPEARANCE, fusion={"relative_weight": 0.0})),
-        Row("causal", config),
-        Row("offline", config, offline=True),
-        Row("causal, anchors at every frame", every_frame),
-        Row("offline, anchors at every frame", every_frame, offline=True),
-    ]
 
 
 def table_of(title: str, rows: Sequence[Row], observations: Sequence[RunLog]) -> Table:
@@ -353,6 +245,38 @@ def clip_table(rows: Sequence[Row], observations: Mapping[str, RunLog]) -> Table
     return Table("E_p by clip, on the same observations", columns, lines)
 
 
+def candidate_table(observations: Mapping[str, RunLog]) -> Table:
+    """What an oracle could reach: the best of the K candidates of every image, and how often the first is wrong."""
+    lines = []
+    for clip, log in observations.items():
+        first = _best_appearance(log)
+        lines.append(
+            {
+                "clip": clip,
+                **metrics.candidate_oracle([group.pose_rows for group in log.candidates], log.T_true),
+                **metrics.summarise(metrics.pose_errors(first, log.T_true)),
+            }
+        )
+    return Table("Candidates of every image", _ORACLE, lines)
+
+
+def range_table(observations: Sequence[RunLog]) -> Table:
+    """Errors of the best appearance by true depth, before any temporal selection."""
+    T_est = np.concatenate([_best_appearance(log) for log in observations])
+    T_true = np.concatenate([log.T_true for log in observations])
+    lines = []
+    for line in metrics.range_bins(T_est, T_true):
+        here = (T_true[:, 2, 3] >= line["depth_from_m"]) & (T_true[:, 2, 3] < line["depth_to_m"])
+        lines.append({**line, "depth_energy_share": metrics.depth_energy_share(T_est[here], T_true[here])})
+    return Table("Best appearance by range", _RANGES, lines)
+
+
+def _best_appearance(log: RunLog) -> np.ndarray:
+    """(N, 4, 4) first candidate of every image, NaN without one."""
+    rows = [group.pose_rows[0] if len(group) else np.full(7, np.nan) for group in log.candidates]
+    return lie.matrix_from_row(np.array(rows).reshape(-1, 7))
+
+
 def pooled(logs: Sequence[RunLog]) -> dict[str, Any]:
     """Errors over all frames of all clips, and those of the anchors chosen at keyframes."""
     T_est = np.concatenate([log.T_est for log in logs])
@@ -368,7 +292,3 @@ def pooled(logs: Sequence[RunLog]) -> dict[str, Any]:
         "anchor_over_90_share": float(np.mean(anchors > metrics.WRONG_BASIN_DEG)) if len(anchors) else float("nan"),
         "anchors": len(anchors),
     }
-
-
-def _with(config: HatConfig, **sections: dict[str, Any]) -> HatConfig:
-    return replace(config, **{name: replace(getattr(config, name), **values) for name, values in sections.items()})

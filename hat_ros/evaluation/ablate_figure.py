@@ -12,16 +12,24 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
+from hat_ros.evaluation.figures import range_figure
 from hat_ros.evaluation.tables import Table
 
 _BAR_COLOR = "#20406a"
 _BARS_COLOR = ("#b5b5b5", "#20406a", "#7f9fc8", "#c98f3d", "#e3c28f")
 
 
-def table_figure(table: Table) -> Figure:
-    """Horizontal bars, first row on top: of ``E_p_mean``, or, where rows are clips, of every column of figures."""
-    rows = table.rows
-    if rows and "E_p_mean" not in rows[0]:
+def table_figure(table: Table) -> Figure | None:
+    """Horizontal bars, first row on top: of ``E_p_mean``, or, where rows are clips, of every column of figures.
+
+    Errors by range become curves; the table of candidates has no figure.
+    """
+    rows, keys = table.rows, {column.key for column in table.columns}
+    if "depth_m_median" in keys:
+        return range_figure(list(rows))
+    if "oracle_median_deg" in keys:
+        return None
+    if "E_p_mean" not in keys:
         return _grouped(table)
     figure, axis = plt.subplots(figsize=(7.0, 0.34 * len(rows) + 0.9), layout="constrained")
     mean, sd = (_numbers(rows, key) for key in ("E_p_mean", "E_p_sd"))

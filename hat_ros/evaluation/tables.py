@@ -11,6 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+_LATEX = {character: "\\" + character for character in "&%$#_{}"} | {
+    "<": "$<$",
+    ">": "$>$",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "\\": r"\textbackslash{}",
+}
+
 
 @dataclass(frozen=True)
 class Column:
@@ -31,7 +39,7 @@ class Column:
     def text(self, row: dict[str, Any]) -> str:
         """The cell of a row, ``-`` when there is no figure."""
         value = row.get(self.key)
-        if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        if _finite(value) is None:
             return "-"
         return format(value, self.form) if self.form else str(value)
 
@@ -78,9 +86,9 @@ class Table:
         return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
     def json(self) -> str:
-        """Title, columns and rows, full precision."""
-        rows = [{column.key: row.get(column.key) for column in self.columns} for row in self.rows]
-        return json.dumps({"title": self.title, "rows": rows}, indent=2) + "\n"
+        """Title, columns and rows, full precision; null where there is no figure."""
+        rows = [{column.key: _finite(row.get(column.key)) for column in self.columns} for row in self.rows]
+        return json.dumps({"title": self.title, "rows": rows}, indent=2, allow_nan=False) + "\n"
 
     def write(self, folder: Path, name: str) -> None:
         """All notations: ``name.txt``, ``.csv``, ``.tex``, ``.json``."""
@@ -88,7 +96,10 @@ class Table:
             (folder / f"{name}.{suffix}").write_text(text, encoding="utf-8")
 
 
+def _finite(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def _escape(text: str) -> str:
-    for character in "&%$#_{}":
-        text = text.replace(character, "\\" + character)
-    return text
+    """Text as LaTeX prints it; ``<`` and ``>`` are other characters in its default fonts."""
+    return "".join(_LATEX.get(character, character) for character in text)

@@ -9,7 +9,7 @@ from hat_ros import lie
 from hat_ros.config import HatConfig, KeyframeConfig, config_from_dict, config_to_dict
 from hat_ros.core.selector import SelectorStage
 from hat_ros.errors import ConfigError, UsageError
-from hat_ros.evaluation import ablate
+from hat_ros.evaluation import ablate, ablate_rows
 from hat_ros.evaluation.ablate_figure import table_figure
 from hat_ros.evaluation.figures import image_bytes
 from hat_ros.evaluation.filters import FilterNoise, ParticleSelector, UkfSelector
@@ -115,7 +115,7 @@ def test_every_frame_after_the_first_anchor_has_a_pose():
 
 def test_selection_earns_its_place_where_appearance_flips():
     log = observations(flip_every=5)
-    rows = {row.name: pooled(row.replay(log)) for row in ablate.component_rows(CONFIG)}
+    rows = {row.name: pooled(row.replay(log)) for row in ablate_rows.component_rows(CONFIG)}
     fusion_only, viterbi = (rows[name] for name in ("keyframe anchors + SLAM fusion", "+ Viterbi basin selection"))
     assert fusion_only["anchor_over_90_share"] == 0.2
     assert viterbi["anchor_over_90_share"] == 0.05, "only the one during the warm-up"
@@ -170,20 +170,20 @@ def test_particles_stay_normalised_and_the_covariance_positive():
 
 
 def test_sweeps_cover_the_papers_settings():
-    names = [row.name for row in ablate.sweep_rows(CONFIG)]
+    names = [row.name for row in ablate_rows.sweep_rows(CONFIG)]
     for name in ("stride 5, K = 5", "stride 40, K = 5", "K = 10", "s0 = 300 px", "D off", "w = 0.5", "no size weight"):
         assert name in names
 
 
 def test_table_pools_the_frames_of_all_clips():
     one, two = observations(n=20), observations(n=60, flip_every=2)
-    table = ablate.table_of("t", [ablate.Row("x", CONFIG)], [one, two])
+    table = ablate.table_of("t", [ablate_rows.Row("x", CONFIG)], [one, two])
     assert table.rows[0]["targets"] == 80
 
 
 def test_clip_table_and_pooled_table_come_from_the_same_rows():
     logs = {"one": observations(flip_every=3), "two": observations(flip_every=4, noise_deg=2.0, seed=1)}
-    rows = ablate.reference_rows(CONFIG)
+    rows = ablate_rows.reference_rows(CONFIG)
     by_clip, together = ablate.clip_table(rows, logs), ablate.table_of("t", rows, list(logs.values()))
     for row in together.rows:
         assert np.mean([line[row["name"]] for line in by_clip.rows]) == pytest.approx(row["E_p_mean"])
@@ -197,14 +197,14 @@ def test_change_is_relative_to_the_row_above():
 
 
 def test_the_inertial_row_differs_from_the_one_above_by_the_prior_alone():
-    above, row = ablate.component_rows(CONFIG)[-2:]
+    above, row = ablate_rows.component_rows(CONFIG)[-2:]
     assert above.config.fusion.inertial_weight == 0.0
     assert row.settings(above.config)["settings"] == {"fusion.inertial_weight": CONFIG.fusion.relative_weight}
 
 
 def test_of_each_filter_the_best_setting_is_shown_and_all_are_told():
     log = observations(flip_every=3, n=30)
-    rows = ablate.table_rows(CONFIG)
+    rows = ablate_rows.table_rows(CONFIG)
     filters = ablate.table_of("f", rows["filters"], [log])
     shown = ablate.with_best_filters(ablate.table_of("s", rows["selectors"], [log]), filters).rows[-2:]
     for kind, row in zip(("particle filter on SO(3)", "UKF"), shown, strict=True):
@@ -216,7 +216,7 @@ def test_of_each_filter_the_best_setting_is_shown_and_all_are_told():
 
 
 def test_the_settings_of_a_row_make_its_configuration():
-    for row in (row for rows in ablate.table_rows(CONFIG).values() for row in rows):
+    for row in (row for rows in ablate_rows.table_rows(CONFIG).values() for row in rows):
         data = config_to_dict(CONFIG)
         for key, value in row.settings(CONFIG)["settings"].items():
             section, name = key.split(".")
@@ -227,9 +227,9 @@ def test_the_settings_of_a_row_make_its_configuration():
 @pytest.mark.parametrize("table", ["rows", "clips"])
 def test_figures_have_a_bar_per_figure_and_the_same_bytes_every_time(table):
     log = observations(n=20)
-    drawn = ablate.table_of("t", [ablate.Row("x", CONFIG), ablate.Row("y", CONFIG)], [log])
+    drawn = ablate.table_of("t", [ablate_rows.Row("x", CONFIG), ablate_rows.Row("y", CONFIG)], [log])
     if table == "clips":
-        drawn = ablate.clip_table(ablate.reference_rows(CONFIG)[:3], {"one": log, "two": log})
+        drawn = ablate.clip_table(ablate_rows.reference_rows(CONFIG)[:3], {"one": log, "two": log})
     figure = table_figure(drawn)
     assert len(figure.axes[0].patches) == (2 if table == "rows" else 6)
     assert image_bytes(figure) == image_bytes(table_figure(drawn))
@@ -241,15 +241,43 @@ def test_plan_merges_presets_and_refuses_bad_ones(tmp_path):
     temporal, front = tmp_path / "temporal.yaml", tmp_path / "front.yaml"
     temporal.write_text("fusion: {gate_angle_deg: 75.0}\nselector: {score_scale: 3.0}\n")
     front.write_text("hypotheses: {max_candidates: 5}\nselector: {score_scale: 0.5}\nfusion: {gate_angle_deg: 1.0}\n")
-    plan = ablate.plan([SourceSpec(clip)], tmp_path / "out", str(temporal), str(front))
+    plan = ablate.plan([(SourceSpec(clip), ())], tmp_path / "out", str(temporal), str(front))
     assert plan.config.fusion.gate_angle_deg == 75.0
     assert (plan.config.hypotheses.max_candidates, plan.config.selector.score_scale) == (5, 0.5)
     assert {job.mode for job in plan.jobs} == {"observe", "tracking"}
     before = [job.fingerprint() for job in plan.jobs]
     temporal.write_text("fusion: {gate_angle_deg: 30.0}\nkeyframes: {gap_frames: 20}\n")
-    again = ablate.plan([SourceSpec(clip)], tmp_path / "out", str(temporal), str(front))
+    again = ablate.plan([(SourceSpec(clip), ())], tmp_path / "out", str(temporal), str(front))
     assert [job.fingerprint() for job in again.jobs] == before, "front ends run again only if they changed"
     with pytest.raises(ConfigError, match="fusion"):
-        ablate.plan([SourceSpec(clip)], tmp_path / "out", str(temporal), overrides=["fusion.nope=1"])
+        ablate.plan([(SourceSpec(clip), ())], tmp_path / "out", str(temporal), overrides=["fusion.nope=1"])
     with pytest.raises(UsageError, match="same name"):
-        ablate.plan([SourceSpec(clip), SourceSpec(clip)], tmp_path / "out", str(temporal))
+        ablate.plan([(SourceSpec(clip), ())] * 2, tmp_path / "out", str(temporal))
+
+
+def test_a_clips_own_settings_reach_its_front_ends_and_the_other_masking_is_run_beside_them(tmp_path):
+    own = ("segmentation.backend=annotated", "slam.masked=false")
+    plan = ablate.plan([(SourceSpec(tmp_path), own)], tmp_path / "out", "default")
+    by_kind = {job.labels["kind"]: job for job in plan.jobs}
+    assert all("segmentation.backend=annotated" in job.overrides for job in plan.jobs)
+    assert by_kind[ablate.OBSERVED].labels["masked"] == "false"
+    other = by_kind[ablate.MASKED_OTHERWISE]
+    assert (other.labels["masked"], other.overrides[-1]) == ("true", "slam.masked=true")
+
+
+def test_size_references_follow_the_configurations():
+    config = replace(CONFIG, selector=replace(CONFIG.selector, size_ref_px=250.0))
+    names = [row.name for row in ablate_rows.sweep_rows(config)]
+    assert [name for name in names if name.startswith("s0")] == [f"s0 = {px} px" for px in (150, 200, 250, 300)]
+
+
+def test_what_the_candidates_hold_clip_by_clip_and_by_range():
+    log = observations(flip_every=4)
+    row = ablate.candidate_table({"one": log}).rows[0]
+    assert row["oracle_within_15_share"] == 1.0
+    assert row["E_q_over_90_share"] == 0.25
+    ranges = ablate.range_table([log, log])
+    assert sum(line["frames"] for line in ranges.rows) == 2 * N
+    assert {line["depth_from_m"] for line in ranges.rows} == {6.0}
+    assert table_figure(ablate.candidate_table({"one": log})) is None
+    assert image_bytes(table_figure(ranges)) == image_bytes(table_figure(ranges))
