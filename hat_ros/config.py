@@ -242,7 +242,8 @@ class RefinementConfig:
     switch_margin: float = option(0.05, "lead in image evidence that a second start within a basin needs", low=0)
     arbitration_margin: float = option(0.15, "summed lead in image evidence that decides between basins", low=0)
     certain_share: float = option(0.9, "overlap and support that need no second anchor to be TRACKING", low=0, high=1)
-    min_margin: float = option(2.0, "lead in path score over other basins that TRACKING needs", low=0)
+    min_margin: float = option(4.0, "lead in path score over other basins that TRACKING needs", low=0)
+    sure_margin: float = option(6.0, "such a lead that needs no second anchor to be TRACKING", low=0)
 
 
 @dataclass(frozen=True)

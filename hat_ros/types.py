@@ -249,17 +249,29 @@ class Selection:
         """No keyframe at this frame."""
         return cls(Candidates.none(), np.zeros(0), np.zeros(0), -1)
 
-    def margin(self, apart_deg: float) -> float:
-        """Lead of the anchor's path score over the best candidate further than ``apart_deg`` from it.
+    def margin(self, R_cam_target: Float, apart_deg: float) -> float:
+        """Lead in path score of an orientation's basin over the best candidate outside it.
 
-        Infinite when there is no other basin, negative when the decoder's own proposal was not accepted, NaN without
-        an anchor.
+        Args:
+            R_cam_target: (3, 3) orientation, not necessarily a candidate's.
+            apart_deg: candidates further than this from it stand in other basins.
+
+        Returns:
+            The lead; infinite when there is no other basin, minus infinity when no candidate stands in this one, NaN
+            without surviving candidates.
         """
+        return self._lead(self.path_score, R_cam_target, apart_deg)
+
+    def appearance_margin(self, R_cam_target: Float, apart_deg: float) -> float:
+        """The same lead in appearance alone, eq. (appearance)/(sizew), which owes nothing to earlier keyframes."""
+        return self._lead(self.scaled_score, R_cam_target, apart_deg)
+
+    def _lead(self, score: Float, R_cam_target: Float, apart_deg: float) -> float:
         if self.selected < 0:
             return float("nan")
-        R = self.candidates.T_cam_target[:, :3, :3]
-        rivals = self.path_score[lie.angle_between(R, R[self.selected]) > np.radians(apart_deg)]
-        return float(self.path_score[self.selected] - rivals.max(initial=-np.inf))
+        apart_rad = lie.angle_between(self.candidates.T_cam_target[:, :3, :3], R_cam_target)
+        near = apart_rad <= np.radians(apart_deg)
+        return float(score[near].max(initial=-np.inf) - score[~near].max(initial=-np.inf))
 
     @property
     def anchor(self) -> Float | None:
@@ -352,7 +364,7 @@ class Estimate:
         slam_epoch: epoch of the motion used.
         gap_frames: frames since the last frame with a measurement of its own (0 = this one has).
         n_resets: alignment resets since the start of the run.
-        margin: lead of the last anchor over the best candidate of another basin, in units of path score; NaN before
+        margin: lead of the output's basin over all others at the last keyframe, in units of path score; NaN before
             the first. The smaller, the more ambiguous; for people (diagnostics) and the state.
     """
 

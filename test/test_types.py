@@ -114,12 +114,16 @@ def test_only_tracking_and_coasting_have_poses():
         estimate.stamp_ns = 2
 
 
-def test_margin_is_the_lead_over_the_best_other_basin():
+def test_margin_is_the_lead_of_a_basin_over_the_best_other_one():
     turns = np.radians([0.0, 10.0, 90.0, 170.0])
     T = lie.transform(lie.so3_exp(np.outer(turns, [0, 0, 1])), np.tile([0.0, 0, 5], (4, 1)))
     candidates = Candidates(lie.row_from_matrix(T), np.zeros(4))
     path = np.array([0.0, -0.5, -3.0, -4.0])
-    assert Selection(candidates, path, path, 0).margin(30.0) == 3.0
-    assert Selection(candidates, path, path, 2).margin(30.0) == -3.0
-    assert Selection(candidates, path, path, 0).margin(175.0) == np.inf
-    assert np.isnan(Selection.none().margin(30.0))
+    selection = Selection(candidates, 2.0 * path, path, 0)
+    R = candidates.T_cam_target[:, :3, :3]
+    assert selection.margin(R[0], 30.0) == selection.margin(R[1], 30.0) == 3.0
+    assert selection.margin(R[2], 30.0) == -3.0
+    assert selection.margin(R[0], 175.0) == np.inf
+    assert selection.margin(lie.so3_exp(np.array([2.0, 0, 0])), 30.0) == -np.inf
+    assert selection.appearance_margin(R[0], 30.0) == 6.0
+    assert np.isnan(Selection.none().margin(R[0], 30.0))

@@ -29,7 +29,8 @@ class Fused:
         reset: the alignment was dropped at this frame.
         measurement: (4, 4) what this frame's own image says, None when it says nothing.
         covariance: (6, 6) of the measurement, None when its source does not know.
-        doubtful: the measurement may stand in the wrong basin.
+        confirmed: the image is certain of the measurement's basin, or an anchor has agreed with it.
+        doubtful: successive anchors stand in another basin than the measurement.
     """
 
     T_cam_target: Float | None
@@ -38,6 +39,7 @@ class Fused:
     reset: bool = False
     measurement: Float | None = None
     covariance: Float | None = None
+    confirmed: bool = False
     doubtful: bool = False
 
 

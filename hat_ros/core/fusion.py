@@ -12,6 +12,7 @@ import numpy as np
 from hat_ros import lie
 from hat_ros.config import HatConfig
 from hat_ros.core.causal import AreaConfidence, CausalFusion, Fused
+from hat_ros.core.confidence import BasinConfidence
 from hat_ros.core.refined import RefinedFusion
 from hat_ros.core.refiner import Refiner
 from hat_ros.core.selector import box_area_px, rotation_increment
@@ -26,8 +27,8 @@ class FusionStage:
     """One :meth:`update` per frame; past outputs are never revised.
 
     States: UNINITIALISED before the first pose. TRACKING while poses are solved for: from anchors and motion, or, with
-    a refiner, supported by this frame's image, not doubtful, and with a lead of the decoder over other basins of at
-    least ``min_margin``. COASTING while the pose is only held, predicted, ambiguous, or in doubt. LOST once
+    a refiner, supported by this frame's image, and in a basin that decoder and appearance vouch for
+    (:class:`BasinConfidence`). COASTING while the pose is only held, predicted, ambiguous, or in doubt. LOST once
     ``coast_limit_frames`` went by without a measurement (an anchor, or a supported refinement); no pose then.
     """
 
@@ -46,7 +47,7 @@ class FusionStage:
         config = self._config
         self._causal = CausalFusion(config.alignment, config.fusion) if self._refiner is None else None
         self._refined = RefinedFusion(config, self._refiner) if self._refiner is not None else None
-        self._confidence = AreaConfidence(config.fusion)
+        self._area_confidence = AreaConfidence(config.fusion)
         self._covariance = ResidualCovariance()
         self._last_pose: Float | None = None
         self._last_quat = np.array([0.0, 0.0, 0.0, 1.0])
@@ -54,7 +55,7 @@ class FusionStage:
         self._gap_frames = 0
         self._n_resets = 0
         self._lost = False
-        self._margin = float("nan")
+        self._confidence = BasinConfidence(config.refinement, config.fusion.gate_angle_deg)
 
     def update(self, frame: Frame, detection: Detection | None, motion: Motion, selection: Selection) -> Estimate:
         """Estimate the pose of one frame.
@@ -67,13 +68,13 @@ class FusionStage:
         """
         anchor, confidence = selection.anchor, 1.0
         if anchor is not None:
-            confidence = self._confidence.update(box_area_px(selection.candidates.box_xyxy))
-            self._margin = selection.margin(self._config.fusion.gate_angle_deg)
+            confidence = self._area_confidence.update(box_area_px(selection.candidates.box_xyxy))
         if self._refined is not None:
             fused = self._refined.update(frame, detection, motion, anchor, confidence)
         else:
             fused = self._causal.update(motion, anchor, confidence)
         self._n_resets += fused.reset
+        self._confidence.update(selection, fused.T_cam_target)
         state, T_cam_target = self._state(fused, motion)
         pose_row, covariance = _NO_POSE, _NO_COVARIANCE
         if state.has_pose:
@@ -93,7 +94,7 @@ class FusionStage:
             slam_epoch=motion.epoch,
             gap_frames=self._gap_frames,
             n_resets=self._n_resets,
-            margin=self._margin,
+            margin=self._confidence.margin,
         )
 
     def _state(self, fused: Fused, motion: Motion) -> tuple[TrackState, Float | None]:
@@ -112,8 +113,8 @@ class FusionStage:
         if self._refined is None:
             certain = fused.T_cam_target is not None
         else:
-            ambiguous = self._margin < self._config.refinement.min_margin
-            certain = fused.measurement is not None and not fused.doubtful and not ambiguous
+            measured = fused.measurement is not None and not fused.doubtful
+            certain = measured and self._confidence.vouches(fused.confirmed)
         return (TrackState.TRACKING if certain else TrackState.COASTING), T_cam_target
 
     def _fill_gap(self, motion: Motion) -> Float | None:

@@ -13,8 +13,8 @@ At keyframes the selected anchor competes with the track:
   (``reset_anchors`` at most, as in the paper), unless the image speaks against them by that margin.
 
 With no refinement supported, the output is what the paper's fusion makes of prediction and anchor, and it coasts. A
-supported output is called TRACKING only if it is beyond doubt as well: the image is certain, or a second anchor has
-agreed; and no two anchors in a row have disagreed since.
+supported output is called TRACKING only if it is beyond doubt as well (``core.confidence``): the image is certain, or a
+second anchor has agreed, or the decoder's lead is large; and no two anchors in a row have disagreed since.
 """
 
 from __future__ import annotations
@@ -214,7 +214,8 @@ class RefinedFusion:
             predicted,
             measurement=T,
             covariance=refined.covariance,
-            doubtful=not certain or self._n_disagreed > 1,
+            confirmed=certain,
+            doubtful=self._n_disagreed > 1,
         )
 
 

@@ -1,0 +1,49 @@
+"""Which basin the hypotheses of the last keyframes vouch for, against the one that the output stands in."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from hat_ros.config import RefinementConfig
+from hat_ros.types import Float, Selection
+
+# Keyframes in a row whose best appearance must lie in the output's basin: errors of a mask persist, but not so long.
+_KEYFRAMES = 2
+
+
+class BasinConfidence:
+    """Compares the output with the decoder and with appearance alone.
+
+    The decoder weighs all keyframes so far, and one clear mistake carries it for a while; the best appearance of a
+    keyframe owes nothing to earlier ones. An output that both vouch for is right; where they differ, nobody knows.
+
+    Args:
+        config: the ``refinement`` section.
+        apart_deg: orientations further apart than this are different basins.
+
+    Attributes:
+        margin: lead in path score of the output's basin at the last keyframe, NaN before the first.
+    """
+
+    def __init__(self, config: RefinementConfig, apart_deg: float) -> None:
+        self._config = config
+        self._apart_deg = apart_deg
+        self.margin = float("nan")
+        self._appearance: deque[float] = deque(maxlen=_KEYFRAMES)
+
+    def update(self, selection: Selection, T_cam_target: Float | None) -> None:
+        """Look at one frame: its candidates, if it is a keyframe, and its output (4, 4), None if there is none."""
+        if T_cam_target is None or selection.selected < 0:
+            return
+        R = T_cam_target[:3, :3]
+        self.margin = selection.margin(R, self._apart_deg)
+        self._appearance.append(selection.appearance_margin(R, self._apart_deg))
+
+    def vouches(self, confirmed: bool) -> bool:
+        """Whether the output's basin is beyond doubt; ``confirmed`` by the image or a second anchor, or not."""
+        if self.margin < self._config.min_margin or min(self._appearance, default=0.0) < 0.0:
+            return False
+        # A lead over nobody says nothing.
+        return confirmed or self._config.sure_margin <= self.margin < np.inf
