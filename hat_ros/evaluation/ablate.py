@@ -1,8 +1,8 @@
 """``hat ablate``: the paper's component table, sensitivity sweeps, filters and offline reference, on any clips.
 
-The front ends run once per clip (``--mode observe``, candidates at every frame); every row re-runs Stages 3 and 4 alone
-over those observations. Errors are pooled over all frames of all clips, as the paper pools a data set. Two more runs per
-clip stand beside them: one whose motion sees masked frames where the first one's sees raw ones, or the other way round,
+The front ends run once per clip (``--mode observe``, candidates at every frame); every row re-runs Stages 3 and 4
+alone over those observations. Errors are pooled over all frames of all clips, as the paper pools a data set. Two runs
+more per clip stand beside them: one whose motion sees masked frames where the first one sees raw ones, or the reverse,
 and one of the tracking baseline.
 """
 
