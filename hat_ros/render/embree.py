@@ -77,15 +77,8 @@ class EmbreeRenderer:
         if x0 >= x1 or y0 >= y1:
             return Rendering(depth, normal, face_id, rgb)
 
-        R, t = T_cam_target[:3, :3], T_cam_target[:3, 3]
-        # Rays in the target frame are affine in (u, v): no per-pixel matrix product.
-        to_ray = R.T @ np.linalg.inv(camera.K)
-        across = np.arange(x0, x1)[:, None] * to_ray[:, 0]
-        down = np.arange(y0, y1)[:, None] * to_ray[:, 1] + to_ray[:, 2]
-        directions = np.add(down[:, None], across[None], dtype=np.float32, casting="same_kind").reshape(-1, 3)
-        origins = np.empty_like(directions)
-        origins[:] = -t @ R
-        hits = self.caster.trace(origins, directions)
+        R = T_cam_target[:3, :3]
+        directions, hits = self._cast(T_cam_target, camera, (x0, y0, x1, y1))
         face = hits["primID"]
         hit = np.flatnonzero(face >= 0)
         rows, cols = np.divmod(hit, x1 - x0)
@@ -102,6 +95,30 @@ class EmbreeRenderer:
             barycentric = np.stack([1.0 - u - v, u, v], axis=-1)
             rgb.reshape(-1, 3)[at] = self._target.surface.sample(face, barycentric, self._target.face_rgb)
         return Rendering(depth, normal, face_id, rgb)
+
+    def silhouette(self, T_cam_target: NDArray[np.float64], camera: Camera) -> NDArray[np.bool_]:
+        """The mask alone, (H, W); cheaper than :meth:`render`."""
+        mask = np.zeros((camera.height, camera.width), np.bool_)
+        x0, y0, x1, y1 = self.pixel_bounds(T_cam_target, camera)
+        if x0 < x1 and y0 < y1:
+            _, hits = self._cast(T_cam_target, camera, (x0, y0, x1, y1))
+            mask[y0:y1, x0:x1] = (hits["primID"] >= 0).reshape(y1 - y0, x1 - x0)
+        return mask
+
+    def _cast(
+        self, T_cam_target: NDArray[np.float64], camera: Camera, bounds: tuple[int, int, int, int]
+    ) -> tuple[NDArray[np.float32], dict[str, NDArray]]:
+        """Directions in the target frame (N, 3), and hits, of the rays through a half-open box of pixels, by rows."""
+        R, t = T_cam_target[:3, :3], T_cam_target[:3, 3]
+        x0, y0, x1, y1 = bounds
+        # Rays in the target frame are affine in (u, v): no per-pixel matrix product.
+        to_ray = R.T @ np.linalg.inv(camera.K)
+        across = np.arange(x0, x1)[:, None] * to_ray[:, 0]
+        down = np.arange(y0, y1)[:, None] * to_ray[:, 1] + to_ray[:, 2]
+        directions = np.add(down[:, None], across[None], dtype=np.float32, casting="same_kind").reshape(-1, 3)
+        origins = np.empty_like(directions)
+        origins[:] = -t @ R
+        return directions, self.caster.trace(origins, directions)
 
     def pixel_bounds(self, T_cam_target: NDArray[np.float64], camera: Camera) -> tuple[int, int, int, int]:
         """Half-open pixel range that can see the target: x0, y0, x1, y1."""

@@ -12,11 +12,11 @@ from __future__ import annotations
 import numpy as np
 
 from hat_ros.config import HatConfig
-from hat_ros.render import create_renderer
+from hat_ros.render.embree import EmbreeRenderer
 from hat_ros.segmentation.lit import LitBody
 from hat_ros.segmentation.masks import Mask, enlarge
 from hat_ros.segmentation.shape import SilhouetteBank
-from hat_ros.segmentation.sky import lit_regions, measure_sky
+from hat_ros.segmentation.sky import dark_border_share, lit_regions, measure_sky
 from hat_ros.segmentation.textured import TexturedBackground
 from hat_ros.target import Target
 from hat_ros.types import Detection, Frame, PosePrior
@@ -32,7 +32,7 @@ class ClassicalSegmenter:
 
     def __init__(self, config: HatConfig, target: Target) -> None:
         self._config = config.segmentation.classical
-        self._renderer = create_renderer("embree", target)
+        self._renderer = EmbreeRenderer(target)
         bank = SilhouetteBank(target, self._renderer)
         self._lit = LitBody(self._config, bank)
         self._textured = TexturedBackground(self._config, bank)
@@ -48,10 +48,11 @@ class ClassicalSegmenter:
         """Find the target in one frame; None rather than a wrong mask."""
         silhouette = self._silhouette(frame, prior)
         trusted = prior is not None and prior.healthy
-        mask = None
-        measured = measure_sky(frame.rgb)
-        black = measured.border_share >= self._config.sky_border_share
-        regions = lit_regions(measured) if black else []
+        mask, black, regions = None, False, []
+        if dark_border_share(frame.rgb) >= self._config.sky_border_share:
+            measured = measure_sky(frame.rgb)
+            black = measured.border_share >= self._config.sky_border_share
+            regions = lit_regions(measured) if black else []
         if regions:
             mask = self._lit.find(measured, regions, self._masks[1], silhouette if trusted else None)
         if mask is None and (regions or not black):
@@ -68,5 +69,5 @@ class ClassicalSegmenter:
         camera = frame.camera
         scale = min(1.0, 2 * self._config.work_side_px / max(camera.width, camera.height))
         small = camera.crop(0, 0, camera.width, camera.height, scale)
-        mask = self._renderer.render(prior.T_cam_target, small, color=False).mask
-        return enlarge(mask.astype(np.uint8), (camera.width, camera.height)) if mask.any() else None
+        mask = self._renderer.silhouette(prior.T_cam_target, small)
+        return enlarge(mask.view(np.uint8), (camera.width, camera.height)) if mask.any() else None

@@ -89,6 +89,14 @@ def shift_between(before: Mask | None, mask: Mask | None) -> tuple[int, int]:
     return int(dx), int(dy)
 
 
+def _reduced(rgb: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """A picture at a smaller size (width, height) by area; halving first is several times faster."""
+    h, w = rgb.shape[:2]
+    if min(w // size[0], h // size[1]) >= 4 and w % 2 == h % 2 == 0:
+        rgb = cv2.resize(rgb, (w // 2, h // 2), interpolation=cv2.INTER_AREA)
+    return cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+
+
 @dataclass(frozen=True)
 class Window:
     """A part of the image at reduced scale: full-resolution corner and size, reduced size, reduced colours."""
@@ -106,7 +114,7 @@ class Window:
         h, w = rgb.shape[:2]
         scale = min(1.0, side_px / max(h, w))
         size = (max(1, round(w * scale)), max(1, round(h * scale)))
-        return cls(0, 0, w, h, scale, cv2.resize(rgb, size, interpolation=cv2.INTER_AREA))
+        return cls(0, 0, w, h, scale, _reduced(rgb, size))
 
     @classmethod
     def around(
@@ -120,8 +128,7 @@ class Window:
             return None
         scale = min(1.0, side_px / max(x1 - x0, y1 - y0))
         size = (max(4, round((x1 - x0) * scale)), max(4, round((y1 - y0) * scale)))
-        part = cv2.resize(rgb[y0:y1, x0:x1], size, interpolation=cv2.INTER_AREA)
-        return cls(x0, y0, x1 - x0, y1 - y0, scale, part)
+        return cls(x0, y0, x1 - x0, y1 - y0, scale, _reduced(rgb[y0:y1, x0:x1], size))
 
     def reduce(self, mask: Mask, shift_xy: tuple[int, int] = (0, 0)) -> Mask:
         """This window of a full-resolution mask, moved by whole pixels, at reduced scale."""

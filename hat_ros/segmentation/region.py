@@ -134,22 +134,25 @@ def tidy(mask: Mask, anchor: Mask | None) -> Mask | None:
     return fill_holes(keep.astype(np.uint8)[label], 0.05)
 
 
-def edge_contrast(rgb: NDArray[np.uint8], mask: Mask) -> tuple[float, float]:
-    """How clearly the mask's outline shows.
-
-    Returns:
-        Lower quartile of the colour step (8-bit, across two pixels) along the outline inside the image, and median of
-        the steps in the background, where an outline drawn by chance would lie; zeros without an outline.
-    """
+def edge_contrast(step: NDArray[np.float32], mask: Mask) -> float:
+    """How clearly a mask's outline shows: lower quartile of the colour steps (h, w) along it; 0 without an outline."""
     outer = cv2.dilate(mask, np.ones((3, 3), np.uint8))
     inner = cv2.erode(mask, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
     outline = outer != inner
     outline[0] = outline[-1] = False
     outline[:, 0] = outline[:, -1] = False
+    steps = step[outline]
+    return float(np.percentile(steps, 25)) if len(steps) >= 8 else 0.0
+
+
+def chance_contrast(step: NDArray[np.float32], mask: Mask) -> float:
+    """Median of the colour steps (h, w) in the background, where an outline drawn by chance would lie."""
     away = cv2.dilate(mask, np.ones((7, 7), np.uint8)) == 0
-    if np.count_nonzero(outline) < 8:
-        return 0.0, 0.0
+    return float(np.median(step[away])) if away.any() else 0.0
+
+
+def color_step(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Colour step (8-bit, across two pixels) at each pixel of an (h, w, 3) image."""
     dx = cv2.Sobel(rgb, cv2.CV_32F, 1, 0, ksize=3, scale=0.25)
     dy = cv2.Sobel(rgb, cv2.CV_32F, 0, 1, ksize=3, scale=0.25)
-    step = np.sqrt((dx * dx + dy * dy).sum(axis=2))
-    return float(np.percentile(step[outline], 25)), float(np.median(step[away])) if away.any() else 0.0
+    return cv2.sqrt(cv2.transform(dx * dx + dy * dy, np.ones((1, 3))))

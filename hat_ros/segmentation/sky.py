@@ -62,19 +62,32 @@ def measure_sky(rgb: NDArray[np.uint8]) -> Sky:
         cols, rows = hot[:, 0].T
         luma[rows, cols] = around[rows, cols]
     mean3 = cv2.boxFilter(luma, cv2.CV_32F, (3, 3))
-    r = min(_RING_PX, min(luma.shape) // 4)
-    # Every other row and column of the border: neighbours share pixels of their means anyway.
-    strips = np.s_[1:r:2, ::2], np.s_[-r:-1:2, ::2], np.s_[r:-r:2, 1:r:2], np.s_[r:-r:2, -r:-1:2]
-    ring = np.concatenate([mean3[strip].ravel() for strip in strips])
-    # Black in every channel: a dark sea is blue.
-    brightest = np.concatenate([rgb[strip].max(axis=2).ravel() for strip in strips])
-    dark = ring[brightest < _SKY_MAX]
+    ring = np.concatenate([mean3[strip].ravel() for strip in _border(luma.shape)])
+    dark = ring[_dark_border(rgb)]
     if dark.size < 8:
         return Sky(luma, mean3, 0.0, 0.0, 0.0)
     level = float(np.median(dark))
     sigma = 1.4826 * float(np.median(np.abs(dark - level)))
     threshold = level + max(_NOISE_SIGMAS * sigma, _MIN_STEP)
     return Sky(luma, mean3, level, threshold, float(np.count_nonzero(dark <= threshold)) / ring.size)
+
+
+def dark_border_share(rgb: NDArray[np.uint8]) -> float:
+    """Share of the image border that is dark enough to be sky, at a glance: never less than ``Sky.border_share``."""
+    dark = _dark_border(rgb)
+    return np.count_nonzero(dark) / max(1, len(dark))
+
+
+def _dark_border(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Which pixels of the border are black in every channel (a dark sea is blue)."""
+    brightest = np.concatenate([rgb[strip].reshape(-1, 3) for strip in _border(rgb.shape)]).max(axis=1)
+    return brightest < _SKY_MAX
+
+
+def _border(shape: tuple[int, ...]) -> tuple[tuple[slice, slice], ...]:
+    """Every other row and column of the image border: neighbours share pixels of their means anyway."""
+    r = min(_RING_PX, min(shape[:2]) // 4)
+    return np.s_[1:r:2, ::2], np.s_[-r:-1:2, ::2], np.s_[r:-r:2, 1:r:2], np.s_[r:-r:2, -r:-1:2]
 
 
 def lit_regions(sky: Sky) -> list[NDArray[np.uint8]]:

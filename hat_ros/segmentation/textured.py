@@ -9,14 +9,21 @@ from numpy.typing import NDArray
 from hat_ros.config import ClassicalConfig
 from hat_ros.segmentation import region
 from hat_ros.segmentation.masks import SIDES, Mask, Window, moved, overlap, shift_between, touched_sides
-from hat_ros.segmentation.search import MIN_CONTRAST, OPEN_BETTER, Found, Search, at_full_resolution, margin_px
+from hat_ros.segmentation.search import (
+    AGREEMENT,
+    MIN_CONTRAST,
+    OPEN_BETTER,
+    Found,
+    Search,
+    at_full_resolution,
+    margin_px,
+)
 from hat_ros.segmentation.shape import SilhouetteBank
 
 _MAX_AREA_CHANGE = 1.6  # from one frame to the next
 _MIN_CONTINUITY = 0.6  # overlap of a tracked mask with its seed
 _MIN_CONTRAST_KEPT = 0.4  # share of its usual contrast at which a tracked outline is lost
 _CONTRAST_GAIN = 0.2
-_AGREEMENT = 0.8  # overlap of two independent masks that mean the same target
 _SAME = 0.95  # overlap of two masks that are the same
 _BENEFIT_OF_DOUBT = 0.1  # less plausibility keeps a mask than finds one
 _CLEARLY_BETTER = 0.025  # plausibility by which another explanation must beat a predicted one
@@ -133,7 +140,7 @@ class TexturedBackground:
         grown = np.count_nonzero(cut) / max(1, np.count_nonzero(seeds[-1]))
         if not 1 / _MAX_AREA_CHANGE <= grown <= _MAX_AREA_CHANGE or overlap(cut, seeds[0]) < _MIN_CONTINUITY:
             return None
-        contrast, _ = region.edge_contrast(window.rgb, cut)
+        contrast = region.edge_contrast(region.color_step(window.rgb), cut)
         if contrast < max(MIN_CONTRAST, _MIN_CONTRAST_KEPT * self._contrast):
             return None
         return region.ClearCut(cut, contrast)
@@ -145,14 +152,17 @@ class TexturedBackground:
     def _cross_check(self, rgb: NDArray[np.uint8], tracked: Mask, aided: bool) -> Mask | None:
         """Compare a tracked mask with what a search from nothing finds; keep the more plausible one.
 
-        A mask held in place by a prediction is given up only for one that means something else.
+        A mask held in place by a prediction is given up only for one that means something else; while a glance finds
+        the same, nothing more is searched.
         """
         self._since_check = 0
+        if aided and self._search.confirms(tracked):
+            return tracked
         found = self._search.find(rgb, touched_sides(tracked))
         agreement = 0.0 if found is None else overlap(found.mask, tracked)
         longer = min(2 * self._check_every, self._config.check_interval_frames)
         self._check_every = longer if agreement >= _SAME else _CHECK_UNAIDED_FRAMES
-        if aided and agreement >= _AGREEMENT:
+        if aided and agreement >= AGREEMENT:
             return tracked
         plausibility, required = self._search.judge(tracked)
         if found is not None and found.plausibility > plausibility + (_CLEARLY_BETTER if aided else 0.0):

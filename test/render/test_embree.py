@@ -123,6 +123,12 @@ def test_a_target_out_of_view_gives_an_empty_picture(t):
     assert not view.mask.any() and not view.depth_m.any() and not view.rgb.any()
 
 
+@pytest.mark.parametrize("t", [[0, 0, 5.0], [1.5, -0.5, 4.0], [0, 0, -5]])
+def test_the_silhouette_alone_is_that_of_the_picture(t):
+    renderer = create_renderer("embree", build_target("cubesat"))
+    np.testing.assert_array_equal(renderer.silhouette(at(t), CAMERA), renderer.render(at(t), CAMERA).mask)
+
+
 def test_a_camera_inside_the_model_sees_its_inner_walls():
     view = create_renderer("embree", scene_target(trimesh.creation.box((2, 2, 2)))).render(at([0, 0, 0]), CAMERA)
     assert view.mask.all() and view.depth_m.min() > 0.9

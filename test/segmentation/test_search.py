@@ -1,0 +1,51 @@
+import cv2
+import numpy as np
+import pytest
+from segmentation_scene import HEIGHT, WIDTH
+
+from hat_ros.config import HatConfig
+from hat_ros.render.embree import EmbreeRenderer
+from hat_ros.segmentation.search import Search
+from hat_ros.segmentation.shape import SilhouetteBank
+
+
+@pytest.fixture
+def search(lopsided):
+    return Search(HatConfig().segmentation.classical, SilhouetteBank(lopsided, EmbreeRenderer(lopsided)))
+
+
+def glances(search, scene, mask_of, frames=range(3, 9)):
+    """Whether single cuts confirm the mask that ``mask_of`` makes of the truth, frame by frame."""
+    out = []
+    for i in range(frames.stop):
+        _, rgb, truth = scene.passing(i)
+        search.push(rgb)
+        if i in frames:
+            out.append(search.confirms(mask_of(truth.astype(np.uint8))))
+    return np.array(out)
+
+
+def test_a_glance_confirms_the_right_mask(search, scene):
+    assert glances(search, scene, lambda truth: truth).all()
+
+
+def test_a_glance_confirms_no_other_mask(search, scene):
+    elsewhere = cv2.circle(np.zeros((HEIGHT, WIDTH), np.uint8), (60, 60), 40, 1, -1)
+    assert not glances(search, scene, lambda _: elsewhere).any()
+    assert not glances(search, scene, lambda truth: np.roll(truth, 30, axis=1)).any()
+    assert not glances(search, scene, lambda truth: np.zeros_like(truth)).any()
+
+
+def test_a_glance_confirms_a_mask_that_the_border_cuts(search, scene):
+    T = scene.pose(0.3, x=-1.9)
+    truth = scene.truth(T).astype(np.uint8)
+    assert truth[:, 0].any()
+    search.push(scene.image(T, ground_shift=3))
+    assert search.confirms(truth)
+
+
+def test_the_outline_at_full_resolution_is_the_found_one(search, scene):
+    _, rgb, truth = scene.passing(4)
+    search.push(rgb)
+    found = search.find(rgb, ())
+    assert np.count_nonzero(found.mask & truth) / np.count_nonzero(found.mask | truth) > 0.9
