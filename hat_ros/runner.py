@@ -199,8 +199,7 @@ def _result_folder(folder: ResultFolder, spec: SourceSpec, config: HatConfig, ho
     """A result folder around a run; one that stops leaves tables and metrics of what was done in ``*.partial``."""
     with folder:
         write_config(folder.path, config)
-        where = {"dataset": spec.dataset, "sequence": spec.sequence, "model": spec.model and str(spec.model.resolve())}
-        write_json(folder.path / RUN_FILE, describe_run(spec.path, spec.sha256(), config, **where, **how))
+        write_json(folder.path / RUN_FILE, describe_run(spec.path, spec.sha256(), config, **spec.describe(), **how))
         try:
             yield
         except BaseException as error:

@@ -69,6 +69,16 @@ class SourceSpec:
     def _with_detections(self, rest: str) -> str:
         return hashlib.sha256(f"{rest}{input_hash(self.detections)}".encode()).hexdigest()
 
+    def describe(self) -> dict[str, str | None]:
+        """What ``run.json`` says about where it is, beside ``source`` itself."""
+        return {
+            "dataset": self.dataset,
+            "sequence": self.sequence,
+            "model": self.model and str(self.model.resolve()),
+            "detections": self.detections and str(self.detections.resolve()),
+            "detections_sha256": self.detections and input_hash(self.detections),
+        }
+
     def open(self) -> Source:
         """Open the recording and its CAD model.
 

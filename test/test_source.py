@@ -99,9 +99,11 @@ def test_detections_computed_elsewhere_are_used_in_place(spark, tmp_path):
     (job, _) = bench_jobs(clips, ["hat"], ["given"], [0], "default")
     assert f"--detections {folder}/RT500.json" in " ".join(job.command(tmp_path))
     spec = clips[0][0]
-    before = spec.sha256()
+    before, told = spec.sha256(), spec.describe()
+    assert told["detections"] == str((folder / "RT500.json").resolve())
     (folder / "RT500.json").write_text(json.dumps({"img001.jpg": [0, 0, 40, 80]}))
     assert spec.sha256() != before != SourceSpec(root, "spark", "RT500", model).sha256()
+    assert spec.describe()["detections_sha256"] != told["detections_sha256"]
 
 
 def test_a_bag_has_its_detections_in_it(tmp_path):

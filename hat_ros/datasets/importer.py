@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import logging
 import shutil
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,10 +18,15 @@ from numpy.typing import NDArray
 from hat_ros.bag import BagWriter
 from hat_ros.datasets.image_files import ImageFile, ImageRecording
 from hat_ros.errors import DatasetError, UsageError
+from hat_ros.provenance import input_hash
 from hat_ros.render import create_renderer
 from hat_ros.segmentation.detections import load_detections
 from hat_ros.target import load_target
 
+LOG = logging.getLogger(__name__)
+
+# In a bag: what the import made it from.
+IMPORT_FILE = "import.json"
 # name -> opener(root, model, sequences)
 FORMATS = {
     "sequence": "hat_ros.datasets.sequence:open_sequences",
@@ -77,7 +85,9 @@ def import_dataset(
 ) -> list[Path]:
     """Write bags: ``out`` itself for the ``sequence`` format, ``out/NAME`` per sequence otherwise.
 
-    Bags that are complete already are left alone, so an interrupted import goes on where it stopped.
+    Bags that are complete already are left alone, so an interrupted import goes on where it stopped. What a bag was
+    made from stands in its ``import.json``; one made with another CAD model, or with other masks or boxes, is written
+    again.
 
     Args:
         fmt: see :func:`open_dataset`, as are ``root``, ``model`` and ``sequences``.
@@ -93,7 +103,8 @@ def import_dataset(
         The bags, complete.
 
     Raises:
-        UsageError, DatasetError, MeshError: see :func:`open_dataset` and ``load_target``.
+        UsageError, DatasetError, MeshError: see :func:`open_dataset` and ``load_target``. Also for a folder that is no
+            bag, or a bag that no import has made and that lacks the boxes or detections asked for.
         RunError: the bag cannot be written.
     """
     if boxes and detections is not None:
@@ -105,11 +116,13 @@ def import_dataset(
         found = detections_by_sequence(Path(detections), recordings)
     for recording in recordings:
         bag = out if fmt == "sequence" else out / recording.name
-        if not _complete(bag):
-            if detections is not None:
-                recording = with_detections(recording, found[recording.name])
+        regions = None if detections is None else found[recording.name]
+        made_from = _made_from(fmt, recording, boxes, regions)
+        if not _complete(bag, made_from):
+            if regions is not None:
+                recording = with_detections(recording, regions)
             recording = with_annotation_boxes(recording) if boxes else recording
-            _write_bag(recording, bag, progress)
+            _write_bag(recording, bag, made_from, progress)
         elif progress is not None:
             progress(recording.name, len(recording), len(recording))
         if check:
@@ -119,15 +132,41 @@ def import_dataset(
     return bags
 
 
-def _complete(bag: Path) -> bool:
-    if (bag / "metadata.yaml").is_file():
+def _made_from(fmt: str, recording: ImageRecording, boxes: bool, detections: Path | None) -> dict[str, Any]:
+    """What decides a bag's content beside the data set's own images and labels."""
+    return {
+        "format": fmt,
+        "sequence": recording.name,
+        "model_sha256": input_hash(recording.target_path),
+        "boxes_from_labels": boxes,
+        "detections": None if detections is None else detections.name,
+        "detections_sha256": None if detections is None else input_hash(detections),
+    }
+
+
+def _complete(bag: Path, made_from: dict[str, Any]) -> bool:
+    """Whether there is a bag made from just this."""
+    if not (bag / "metadata.yaml").is_file():
+        if bag.exists():
+            raise UsageError(f"{bag} exists and is not a bag; choose another --out or remove it")
+        return False
+    try:
+        before = json.loads((bag / IMPORT_FILE).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        if made_from["boxes_from_labels"] or made_from["detections"]:
+            raise UsageError(
+                f"{bag} is a bag that no import has made, its masks are not replaced: choose another --out or remove it"
+            ) from None
         return True
-    if bag.exists():
-        raise UsageError(f"{bag} exists and is not a bag; choose another --out or remove it")
-    return False
+    except (OSError, ValueError):
+        before = {}
+    changed = [key for key, value in made_from.items() if before.get(key) != value]
+    if changed:
+        LOG.warning("%s was made with other %s: writing it again", bag, ", ".join(changed))
+    return not changed
 
 
-def _write_bag(recording: ImageRecording, bag: Path, progress: Progress | None) -> None:
+def _write_bag(recording: ImageRecording, bag: Path, made_from: dict[str, Any], progress: Progress | None) -> None:
     """Write beside the goal and rename, so that a bag under its own name is always complete."""
     load_target(recording.target_path, recording.unit_scale)  # a bad CAD model is found before the long part
     partial = bag.with_name(f"{bag.name}.partial")
@@ -145,6 +184,10 @@ def _write_bag(recording: ImageRecording, bag: Path, progress: Progress | None) 
             if progress is not None:
                 progress(recording.name, index + 1, len(recording))
         writer.write_target(recording.target_path, recording.unit_scale, recording.name)
+        text = json.dumps(made_from, indent=2) + "\n"
+        (partial / bag.name / IMPORT_FILE).write_text(text, encoding="utf-8")
+    if bag.exists():  # made from something else
+        shutil.rmtree(bag)
     (partial / bag.name).rename(bag)
     partial.rmdir()
 

@@ -14,7 +14,13 @@ from hat_ros.bag import BagReader
 from hat_ros.datasets import spark
 from hat_ros.datasets.bop import open_bop
 from hat_ros.datasets.image_files import camera_from_label, stamp_of
-from hat_ros.datasets.importer import check_picture, import_dataset, open_dataset, with_annotation_boxes
+from hat_ros.datasets.importer import (
+    IMPORT_FILE,
+    check_picture,
+    import_dataset,
+    open_dataset,
+    with_annotation_boxes,
+)
 from hat_ros.datasets.sequence import load_sequence, write_labels
 from hat_ros.errors import DatasetError, MeshError, UsageError
 from hat_ros.target import load_target
@@ -584,6 +590,32 @@ def test_detections_that_do_not_fit(sequence, tmp_path, data, says):
     with pytest.raises(DatasetError, match=says):
         import_dataset("sequence", sequence, tmp_path / "bag", detections=path)
     assert not (tmp_path / "bag").exists()
+
+
+def test_a_bag_made_with_other_masks_or_another_model_is_written_again(sequence, tmp_path, caplog):
+    def masks(**more):
+        (bag,) = import_dataset("sequence", sequence, tmp_path / "bag", **more)
+        return [None if mask is None else mask.tobytes() for mask in given_masks(bag)]
+
+    own = masks()
+    path = write_json(tmp_path / "cnos.json", [cnos(0, spot(20))])
+    found = masks(detections=path)
+    assert found != own and "detections" in caplog.text
+    caplog.clear()
+    assert masks(detections=path) == found and not caplog.text, "the same again is left alone"
+    write_json(path, [cnos(0, spot(24))])
+    assert masks(detections=path) != found and "detections_sha256" in caplog.text
+    assert masks() == own
+    assert not (tmp_path / "bag.partial").exists()
+
+
+def test_a_bag_that_no_import_made_keeps_its_masks(sequence, tmp_path):
+    (bag,) = import_dataset("sequence", sequence, tmp_path / "bag")
+    (bag / IMPORT_FILE).unlink()
+    (bag / "manifest.json").unlink()
+    assert import_dataset("sequence", sequence, bag) == [bag]
+    with pytest.raises(UsageError, match="no import has made"):
+        import_dataset("sequence", sequence, bag, detections=write_json(tmp_path / "cnos.json", [cnos(0, spot(20))]))
 
 
 def test_detections_and_boxes_from_the_labels_exclude_each_other(sequence, tmp_path):
