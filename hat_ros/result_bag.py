@@ -6,7 +6,7 @@ back into one :class:`~hat_ros.runlog.RunLog`. Bag time is the exposure stamp.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -129,6 +129,23 @@ def read_result_bag(path: Path) -> RunLog:
     return builder.build(truth)
 
 
+def read_stage_ms(path: Path) -> dict[str, float]:
+    """Node name -> mean wall time per frame in milliseconds, as the nodes last said in their diagnostics.
+
+    Empty for a bag that no graph has written, or where the graph had only begun.
+
+    Raises:
+        BagError: missing or damaged.
+    """
+    out = {}
+    for message in _read(path, (topics.DIAGNOSTICS,))[topics.DIAGNOSTICS]:
+        for status in message.status:
+            for item in status.values:
+                if item.key == topics.STEP_MS:
+                    out[status.name.removeprefix("hat: ")] = float(item.value)
+    return out
+
+
 _READ = (
     topics.STATUS,
     topics.HYPOTHESES_SCORED,
@@ -140,20 +157,27 @@ _READ = (
 
 def _messages(path: Path) -> dict[str, dict[int, Any]]:
     """Topic -> stamp -> message, of the topics that an evaluation needs."""
+    found = _read(path, _READ)
+    if not found[topics.STATUS]:
+        raise BagError(f"{path} is no result bag: it has no message on {topics.STATUS}")
+    return {topic: {wire.stamp_of(message): message for message in messages} for topic, messages in found.items()}
+
+
+def _read(path: Path, names: Collection[str]) -> dict[str, list[Any]]:
+    """Topic -> messages in order."""
     if not (path / "metadata.yaml").is_file():
         raise BagError(f"{path} is no result bag: it has no metadata.yaml (a run that was killed?)")
     check_manifest(path)
-    out: dict[str, dict[int, Any]] = {topic: {} for topic in _READ}
+    out: dict[str, list[Any]] = {topic: [] for topic in names}
     try:
         with Reader(path) as reader:
             wanted = [connection for connection in reader.connections if connection.topic in out]
+            if not wanted:
+                return out
             for connection, _, data in reader.messages(connections=wanted):
-                message = deserialize(bytes(data), connection.msgtype, path)
-                out[connection.topic][wire.stamp_of(message)] = message
+                out[connection.topic].append(deserialize(bytes(data), connection.msgtype, path))
     except HatError:
         raise
     except Exception as error:  # whatever a parser of foreign bytes raises means one thing: the bag is damaged
         raise BagError(f"{path} is damaged: {' '.join(str(error).split())[:200]}") from None
-    if not out[topics.STATUS]:
-        raise BagError(f"{path} is no result bag: it has no message on {topics.STATUS}")
     return out

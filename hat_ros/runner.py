@@ -20,7 +20,7 @@ from hat_ros.evaluation.metrics import mask_summary
 from hat_ros.methods import create_method
 from hat_ros.pipeline import MEASURED, WARMUP_FRAMES, Pipeline, latency_summary, memory_summary
 from hat_ros.provenance import describe_run
-from hat_ros.result_bag import ResultBagWriter
+from hat_ros.result_bag import ResultBagWriter, read_stage_ms
 from hat_ros.results import RUN_FILE, LiveTables, ResultFolder, write_config, write_json
 from hat_ros.source import Source, SourceSpec
 from hat_ros.tracker import Step
@@ -176,7 +176,7 @@ def replay_bag(
             max_frames=options.limit,
             on_progress=progress,
         )
-        measured = _measured_by(result, clock)
+        measured = _measured_by(result, clock) | _stage_times(folder.bag_path)
         complete_folder(folder.path, source, measured, video=options.video, report=options.report)
     return folder.final_path
 
@@ -192,6 +192,11 @@ def _measured_by(result: ReplayResult, clock: list[float]) -> dict[str, Any]:
         "latency_ms_p99": float(percentiles[1]),
         "peak_memory_mib": result.peak_memory_mib,
     }
+
+
+def _stage_times(bag: Path) -> dict[str, float]:
+    """Mean time per stage as the nodes measured it, under the names of ``metrics.json``."""
+    return {f"{'motion' if node == 'slam' else node}_ms_mean": ms for node, ms in read_stage_ms(bag).items()}
 
 
 @contextmanager

@@ -254,6 +254,8 @@ class HatNode(LifecycleNode):
         if stuck:
             self.fail(RunError(f"not acknowledged by all readers at the end of the stream: {', '.join(stuck)}"))
         self.report(OK, "end of stream")
+        # The last figures count most: the process may end next.
+        self._diagnostics.wait_for_all_acked(Duration(seconds=_ACK_TIMEOUT_S))
         self.finished = self.finished or self.settings.exit_at_end
 
     def _acknowledged(self, topic: str) -> bool:

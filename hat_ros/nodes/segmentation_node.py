@@ -15,7 +15,7 @@ from hat_ros.core.sync import Admission
 from hat_ros.errors import FrameError, StageTimeoutError
 from hat_ros.nodes import base, process, qos, topics, wire
 from hat_ros.nodes.entrance import Entrance
-from hat_ros.nodes.stage_node import ExtraDelay
+from hat_ros.nodes.stage_node import ExtraDelay, StepTimer
 from hat_ros.segmentation.stage import SegmentationStage
 from hat_ros.types import Frame
 
@@ -41,6 +41,7 @@ class SegmentationNode(base.HatNode):
         self._ready_nodes: set[str] = set()
         self._entered_s: dict[int, float] = {}
         self._delay = ExtraDelay(self.NAME, config.graph.debug_stage_delay_ms)
+        self._step_timer = StepTimer()
         for topic in (topics.IMAGE, topics.IMAGE_COMPRESSED):
             self.input(topic, partial(self._on_image, topic), required=False, with_info=True)
         self.input(topics.CAMERA_INFO, self._on_camera_info, required=False)
@@ -67,7 +68,8 @@ class SegmentationNode(base.HatNode):
         if self.admission is None:
             return {}
         admitted, flight = self.admission.seq + 1, len(self.admission.in_flight)
-        return {"admitted": admitted, "dropped": self.entrance.dropped_total, "in_flight": flight}
+        counts = {"admitted": admitted, "dropped": self.entrance.dropped_total, "in_flight": flight}
+        return counts | self._step_timer.values()
 
     def _on_image(self, topic: str, message: Any, info: dict[str, Any]) -> None:
         self.entrance.add_image(topic, message, info["publication_sequence_number"])
@@ -125,8 +127,9 @@ class SegmentationNode(base.HatNode):
         admitted = wire.Admitted(seq, self.entrance.dropped_total, self.epoch)
         self._admission.publish(self.wire.admission(stamp_ns, frame_id, admitted))
         self._delay.wait()
-        detection = self.stage.update(frame, self.priors.before(stamp_ns))
-        self._frame.publish(self.wire.frame(stamp_ns, frame_id, frame.rgb, detection))
+        with self._step_timer.frame():
+            detection = self.stage.update(frame, self.priors.before(stamp_ns))
+            self._frame.publish(self.wire.frame(stamp_ns, frame_id, frame.rgb, detection))
 
     def _check_time(self) -> None:
         """A stage that does not answer: a replay ends, a live graph goes on in a new epoch."""

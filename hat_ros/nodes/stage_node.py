@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import random
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -28,6 +30,30 @@ class ExtraDelay:
         """Sleep, if a delay was asked for."""
         if self._longest_s > 0:
             time.sleep(self._longest_s * self._random.random())
+
+
+class StepTimer:
+    """Mean wall time of a stage per frame, reading and writing its messages included; the first frames are left out."""
+
+    WARMUP_FRAMES = 10
+
+    def __init__(self) -> None:
+        self._frames = 0
+        self._seconds = 0.0
+
+    @contextmanager
+    def frame(self) -> Iterator[None]:
+        """Around the work on one frame."""
+        start = time.perf_counter()
+        yield
+        self._frames += 1
+        if self._frames > self.WARMUP_FRAMES:
+            self._seconds += time.perf_counter() - start
+
+    def values(self) -> dict[str, str]:
+        """The figure for diagnostics, once there is one."""
+        timed = self._frames - self.WARMUP_FRAMES
+        return {topics.STEP_MS: f"{1e3 * self._seconds / timed:.4f}"} if timed > 0 else {}
 
 
 class StageNode(HatNode):
@@ -56,6 +82,7 @@ class StageNode(HatNode):
         self._epoch: int | None = None
         self._answered = 0
         self._delay = ExtraDelay(self.NAME, self.settings.config.graph.debug_stage_delay_ms)
+        self._step_timer = StepTimer()
         self._join = ExactJoin((topics.ADMISSION, *self.joined()))
         if topics.FRAME in self.joined():
             self.input(topics.HAT_CAMERA_INFO, self._on_camera_info)
@@ -85,7 +112,8 @@ class StageNode(HatNode):
         """Figures for diagnostics."""
         if self._join is None:
             return {}
-        return {"answered": self._answered, "waiting": len(self._join), "late": self._join.late}
+        counts = {"answered": self._answered, "waiting": len(self._join), "late": self._join.late}
+        return counts | self._step_timer.values()
 
     def every_second(self) -> None:
         """Say what the oldest waiting frame lacks."""
@@ -117,7 +145,8 @@ class StageNode(HatNode):
                 return
             self._join.take()
             self._delay.wait()
-            self.step(stamp_ns, items[topics.ADMISSION].header.frame_id, admitted, items)
+            with self._step_timer.frame():
+                self.step(stamp_ns, items[topics.ADMISSION].header.frame_id, admitted, items)
             self._answered += 1
 
     def _may_start(self, stamp_ns: int) -> bool:

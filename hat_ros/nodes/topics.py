@@ -73,6 +73,9 @@ RECORDED = (
     DIAGNOSTICS,
 )
 
+# Figure in the diagnostics of a stage's node: mean wall time per frame, milliseconds.
+STEP_MS = "step_ms"
+
 # Columns of the table topics, in order; all FLOAT64.
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 CANDIDATE_COLUMNS = (*POSE_COLUMNS, "score", "rank", "bx0", "by0", "bx1", "by1")

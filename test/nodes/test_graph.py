@@ -15,7 +15,7 @@ from hat_ros.config import config_from_dict, config_to_dict
 from hat_ros.errors import BagError, ConfigError, InputError, RunError, StageTimeoutError
 from hat_ros.nodes import topics
 from hat_ros.nodes.graph import replay
-from hat_ros.result_bag import read_result_bag
+from hat_ros.result_bag import read_result_bag, read_stage_ms
 from hat_ros.types import Camera, TrackState
 
 pytestmark = pytest.mark.graph
@@ -55,6 +55,8 @@ def test_graph_gives_the_bytes_of_one_process(clean_bag, config, in_process, tmp
     assert status_column(found, "seq") == list(range(N_FRAMES))
     log = read_result_bag(tmp_path / "out")
     assert np.isfinite(log.truth_rows).all(), "the truth stands in the record, put there past the nodes"
+    took_ms = read_stage_ms(tmp_path / "out")
+    assert set(took_ms) == set(DELAYS_MS) and all(0 < ms < 1e3 for ms in took_ms.values()), took_ms
 
 
 def test_corrupt_later_frames_change_nothing_earlier(write_bag, config, in_process, tmp_path):
