@@ -28,7 +28,7 @@ _CORNER_QUALITY = 0.004
 # crowd together, and a crowd says little about depth.
 _EVENNESS = 0.5
 # New corners are looked for once this share of the slots is free.
-_WORTHWHILE_SHARE = 0.05
+_WORTHWHILE_SHARE = 0.1
 
 
 class PointTracks:
@@ -111,7 +111,7 @@ def follow(previous: Image, current: Image, xy: Float, xy_guess: Float) -> tuple
         "minEigThreshold": _MIN_EIGENVALUE,
     }
     moved, ok, _ = cv2.calcOpticalFlowPyrLK(before, after, start, guess, maxLevel=_LEVELS, **options)
-    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, start.copy(), maxLevel=1, **options)
+    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, start.copy(), maxLevel=0, **options)
     found = (ok[:, 0] > 0) & (ok_back[:, 0] > 0) & (np.linalg.norm(back - start, axis=1) < _BACKWARD_TOLERANCE_PX)
     size = np.array([x1 - x0, y1 - y0])
     found &= ((moved >= 0) & (moved <= size - 1)).all(axis=1)
@@ -135,11 +135,9 @@ def detect(image: Image, region: Image, taken: Float, count: int, spacing_px: fl
     if min(width, height) < _WINDOW_PX // 2 or count <= 0:
         return np.zeros((0, 2))
     free = region[y : y + height, x : x + width].copy()
-    blocked = np.zeros(free.shape, np.uint8)
-    col, row = np.clip(np.rint(taken).astype(int) - [x, y], 0, [width - 1, height - 1]).T
-    blocked[row, col] = 1
-    side = 2 * max(1, round(spacing_px)) + 1
-    free[cv2.dilate(blocked, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))) > 0] = 0
+    radius = max(1, round(spacing_px))
+    for center in np.rint(taken).astype(int) - [x, y]:
+        cv2.circle(free, center.tolist(), radius, 0, -1)
     crop = np.ascontiguousarray(image[y : y + height, x : x + width])
     corners = cv2.goodFeaturesToTrack(crop, count, _CORNER_QUALITY, spacing_px, mask=free, blockSize=5)
     if corners is None:
