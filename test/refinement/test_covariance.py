@@ -1,7 +1,8 @@
 import numpy as np
 
 from hat_ros import lie
-from hat_ros.refinement.covariance import OUTLINE_SIGMA_PX, outline_floor
+from hat_ros.refinement.covariance import OUTLINE_SIGMA_PX, USUAL_MISFIT_PX, outline_floor, outline_misfit_px
+from hat_ros.refinement.view import Overlap
 
 
 def test_an_outline_too_wide_all_around_is_a_depth_error():
@@ -18,3 +19,15 @@ def test_the_floor_follows_the_line_of_sight():
     values, vectors = np.linalg.eigh(outline_floor(T, 1000.0, 1.0)[:3, :3])
     np.testing.assert_allclose(np.abs(vectors[:, -1]), [0.6, 0.0, 0.8], atol=1e-12)
     assert values[-1] > 10 * values[0]
+
+
+def test_the_misfit_is_the_mean_distance_of_outlines_beyond_the_usual():
+    areas = Overlap(common=1000.0, extra=100.0, missing=150.0, hidden=50.0)
+    assert outline_misfit_px(areas, 100.0) == 3.0 - USUAL_MISFIT_PX
+    assert outline_misfit_px(Overlap(1000.0, 10.0, 0.0, 0.0), 100.0) == 0.0
+
+
+def test_outlines_that_disagree_widen_the_floor():
+    T = lie.transform(np.eye(3), np.array([0.0, 0.0, 10.0]))
+    good, bad = (outline_floor(T, 1000.0, 1.0, misfit) for misfit in (0.0, 2.0))
+    np.testing.assert_allclose(bad, good * (1.0 + (2.0 / OUTLINE_SIGMA_PX) ** 2))
