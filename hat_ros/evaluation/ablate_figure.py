@@ -20,7 +20,7 @@ _BARS_COLOR = ("#b5b5b5", "#20406a", "#7f9fc8", "#c98f3d", "#e3c28f")
 
 
 def table_figure(table: Table) -> Figure | None:
-    """Horizontal bars, first row on top: of ``E_p_mean``, or, where rows are clips, of every column of figures.
+    """Horizontal bars, first row on top: mean E_p, one SD and the figure; where rows are clips, of every column.
 
     Errors by range become curves; the table of candidates has no figure.
     """
@@ -37,6 +37,11 @@ def table_figure(table: Table) -> Figure | None:
     axis.barh(y, mean, height=0.62, color=_BAR_COLOR)
     rightwards = [np.zeros(len(rows)), np.nan_to_num(sd)]
     axis.errorbar(mean, y, xerr=rightwards, fmt="none", ecolor="#888888", capsize=2, linewidth=1)
+    for level, end in zip(y, mean + rightwards[1], strict=True):
+        if np.isfinite(end):
+            axis.annotate(f"{mean[level]:.4f}", (end, level), (4, 0), textcoords="offset points", va="center", size=7)
+    axis.margins(x=0.12)
+    axis.set_xlim(left=0.0)
     _finish(figure, table, [str(row[table.columns[0].key]) for row in rows])
     return figure
 
@@ -59,7 +64,7 @@ def _finish(figure: Figure, table: Table, names: list[str]) -> None:
     axis.set_yticks(np.arange(len(names)), names, fontsize=8)
     axis.invert_yaxis()
     axis.set_xlabel("$E_p$", fontsize=9)
-    axis.set_title(table.title, fontsize=10)
+    axis.set_title(table.title.replace("E_p", "$E_p$"), fontsize=10)
     axis.spines[["top", "right"]].set_visible(False)
 
 
