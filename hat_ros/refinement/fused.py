@@ -55,10 +55,13 @@ class FusedPoseRefiner:
         """
         field = MaskField(detection.mask) if detection is not None and detection.silhouette else None
         luma = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        start = T_cam_target
-        if field is not None:
-            start = self._fitter.centred(T_cam_target, frame.camera, field, luma)
-        fit = self._fit(frame, field, start)
+        start, fit = T_cam_target, self._fine(frame, field, T_cam_target)
+        if fit is None:
+            if field is not None:
+                start = self._fitter.centred(T_cam_target, frame.camera, field, luma)
+            if start is not T_cam_target:
+                fit = self._fine(frame, field, start)
+            fit = fit or self._fit_all(frame, field, start)
         if fit is not None and field is not None and _lies_in_shadow(field.compare(fit.view, luma)):
             # Part of the silhouette cannot be seen: find out which, and fit what can.
             sunlight = self._sun.match(start, frame, field.mask)
@@ -78,17 +81,14 @@ class FusedPoseRefiner:
             overlap, visible_overlap = areas.union_share, areas.visible_share
         return Refined(lie.row_from_matrix(fit.T_cam_target), covariance, overlap, fit.support, visible_overlap)
 
-    def _fit(self, frame: Frame, field: MaskField | None, start: NDArray[np.float64]) -> Fit | None:
-        """The finest round alone where that explains the image and hardly moves the start, else all rounds."""
-        if field is not None:
-            fine = self._fitter.fit(start, frame.camera, frame.rgb, field, WITH_MASK[-1:], self._start_sigma_rad)
-            if (
-                fine is not None
-                and fine.support >= _ENOUGH_SUPPORT
-                and self._largest_move_px(start, fine.T_cam_target, frame.camera) <= _SMALL_MOVE_PX
-            ):
-                return fine
-        return self._fit_all(frame, field, start)
+    def _fine(self, frame: Frame, field: MaskField | None, start: NDArray[np.float64]) -> Fit | None:
+        """The finest round alone; None unless that explains the image and hardly moves the start."""
+        if field is None:
+            return None
+        fit = self._fitter.fit(start, frame.camera, frame.rgb, field, WITH_MASK[-1:], self._start_sigma_rad)
+        if fit is None or fit.support < _ENOUGH_SUPPORT:
+            return None
+        return fit if self._largest_move_px(start, fit.T_cam_target, frame.camera) <= _SMALL_MOVE_PX else None
 
     def _fit_all(
         self,
