@@ -11,7 +11,7 @@ from hat_ros.config import RefinementConfig
 from hat_ros.refinement.covariance import outline_floor, pose_covariance
 from hat_ros.refinement.refiner import WITH_MASK, WITHOUT_MASK, Fit, PoseFitter
 from hat_ros.refinement.sunlight import SunMatcher
-from hat_ros.refinement.view import MaskField, Overlap, TargetViewer
+from hat_ros.refinement.view import MaskField, Overlap, TargetViewer, View
 from hat_ros.target import Target
 from hat_ros.types import Camera, Detection, Frame, Refined
 
@@ -55,13 +55,7 @@ class FusedPoseRefiner:
         """
         field = MaskField(detection.mask) if detection is not None and detection.silhouette else None
         luma = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        start, fit = T_cam_target, self._fine(frame, field, T_cam_target)
-        if fit is None:
-            if field is not None:
-                start = self._fitter.centred(T_cam_target, frame.camera, field, luma)
-            if start is not T_cam_target:
-                fit = self._fine(frame, field, start)
-            fit = fit or self._fit_all(frame, field, start)
+        start, fit = self._fit(frame, field, luma, T_cam_target)
         if fit is not None and field is not None and _lies_in_shadow(field.compare(fit.view, luma)):
             # Part of the silhouette cannot be seen: find out which, and fit what can.
             sunlight = self._sun.match(start, frame, field.mask)
@@ -81,12 +75,26 @@ class FusedPoseRefiner:
             overlap, visible_overlap = areas.union_share, areas.visible_share
         return Refined(lie.row_from_matrix(fit.T_cam_target), covariance, overlap, fit.support, visible_overlap)
 
-    def _fine(self, frame: Frame, field: MaskField | None, start: NDArray[np.float64]) -> Fit | None:
+    def _fit(
+        self, frame: Frame, field: MaskField | None, luma: NDArray[np.uint8], start: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], Fit | None]:
+        """The finest round alone where that will do, else all rounds, centred if need be: where from, and the fit."""
+        view = self._viewer.view(start, frame.camera, self._config.render_px)
+        fit = self._fine(frame, field, start, view)
+        if fit is None and field is not None:
+            centred = self._fitter.centred(start, frame.camera, field, luma)
+            if centred is not start:
+                start, view = centred, self._viewer.view(centred, frame.camera, self._config.render_px)
+                fit = self._fine(frame, field, start, view)
+        return start, fit or self._fit_all(frame, field, start, view=view)
+
+    def _fine(self, frame: Frame, field: MaskField | None, start: NDArray[np.float64], view: View | None) -> Fit | None:
         """The finest round alone; None unless that explains the image and hardly moves the start."""
-        if field is None:
+        if field is None or view is None:
             return None
-        fit = self._fitter.fit(start, frame.camera, frame.rgb, field, WITH_MASK[-1:], self._start_sigma_rad)
-        if fit is None or fit.support < _ENOUGH_SUPPORT:
+        rounds = WITH_MASK[-1:]
+        fit = self._fitter.fit(start, frame.camera, frame.rgb, field, rounds, self._start_sigma_rad, view=view)
+        if fit.support < _ENOUGH_SUPPORT:
             return None
         return fit if self._largest_move_px(start, fit.T_cam_target, frame.camera) <= _SMALL_MOVE_PX else None
 
@@ -96,13 +104,14 @@ class FusedPoseRefiner:
         field: MaskField | None,
         start: NDArray[np.float64],
         to_sun_cam: NDArray[np.float64] | None = None,
+        view: View | None = None,
     ) -> Fit | None:
         """All rounds, from the widest to the finest."""
         rounds = WITHOUT_MASK
         if field is not None:
             factor = float(np.clip(field.size_px / _USUAL_SIZE_PX, *_SCALE_LIMITS))
             rounds = (WITH_MASK[0].scaled(factor), *WITH_MASK[1:])
-        return self._fitter.fit(start, frame.camera, frame.rgb, field, rounds, self._start_sigma_rad, to_sun_cam)
+        return self._fitter.fit(start, frame.camera, frame.rgb, field, rounds, self._start_sigma_rad, to_sun_cam, view)
 
     def reset(self) -> None:
         """Nothing to forget: every frame stands for itself."""

@@ -107,19 +107,20 @@ class PoseFitter:
         rounds: tuple[Schedule, ...],
         prior_sigma_rad: float = np.inf,
         to_sun_cam: NDArray[np.float64] | None = None,
+        view: View | None = None,
     ) -> Fit | None:
         """Refine a pose whose rotation is known to a sigma; None when the target leaves the view on the way.
 
-        With a direction to the sun the contour is that of the sunlit part.
+        With a direction to the sun the contour is that of the sunlit part. The view of the start spares its rendering.
         """
         T = T_cam_target
         fit = None
         for schedule in rounds:
-            view = self.viewer.view(T, camera, self._render_px, to_sun_cam)
+            view = view or self.viewer.view(T, camera, self._render_px, to_sun_cam)
             if view is None:
                 return None
             fit = self.iterate(T, view, camera, image, field, schedule, prior_sigma_rad)
-            T = fit.T_cam_target
+            T, view = fit.T_cam_target, None
         return fit
 
     def pull(
