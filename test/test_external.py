@@ -190,5 +190,5 @@ def test_another_file_of_poses_is_another_run(bag, tmp_path):
     assert job(a).fingerprint() == job(a).fingerprint()
     with pytest.raises(UsageError, match="does not exist"):
         job(tmp_path / "c.tum")
-    with pytest.raises(UsageError, match="runs already"):
+    with pytest.raises(UsageError, match="two methods are called hat"):
         job(a, "hat")

@@ -25,7 +25,7 @@ def _add_campaign(parser: argparse.ArgumentParser) -> None:
         "recordings",
         nargs="*",
         metavar="SEQ",
-        help="bag or sequence folder; SEQ@key=value[,key=value] gives one clip settings of its own",
+        help="bag or sequence folder, * allowed; SEQ@key=value[,key=value] gives these clips settings of their own",
     )
     add_dataset(parser)
     parser.add_argument("--root", type=Path, metavar="DIR", help="root folder of the --dataset; no bags are written")
@@ -118,9 +118,18 @@ def _add_bench(commands: Commands) -> None:
     parser.add_argument(
         "--modes",
         type=_names(*MODES, "graph"),
-        default=["hat", "independent"],
         metavar="LIST",
-        help=f"methods, from {','.join(MODES)} and graph (bags through ROS) (default: hat,independent)",
+        help=f"methods, from {','.join(MODES)} and graph (bags through ROS) (default: hat,independent, unless there is "
+        "a --method)",
+    )
+    parser.add_argument(
+        "--method",
+        dest="methods",
+        action="append",
+        default=[],
+        metavar="NAME=MODE[:CONFIG][,KEY=VALUE]",
+        help="a method under a name and with a configuration of its own, e.g. Mega-HAT=hat:mega_hat or "
+        "MegaPose=independent:mega_hat (repeatable)",
     )
     parser.add_argument(
         "--masks",
@@ -156,15 +165,17 @@ def _bench(arguments: argparse.Namespace) -> int:
     from hat_ros.evaluation.campaign import run_campaign
     from hat_ros.evaluation.figures import image_bytes
 
+    methods = [bench.Entry.parse(text, arguments.config) for text in arguments.methods]
     jobs = bench.bench_jobs(
         _clips(arguments),
-        arguments.modes,
+        arguments.modes or ([] if methods else ["hat", "independent"]),
         arguments.masks,
         arguments.start,
         arguments.config,
         arguments.overrides,
         arguments.limit,
         dict(arguments.poses),
+        methods,
     )
     out = arguments.out.resolve()
     with campaign_progress(len(jobs)) as watch:

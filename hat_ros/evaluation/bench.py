@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from glob import glob
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +15,9 @@ from hat_ros.datasets.importer import detections_by_sequence, open_dataset
 from hat_ros.datasets.suite import SUITE, SUITE_SETTINGS
 from hat_ros.errors import UsageError
 from hat_ros.evaluation import metrics
-from hat_ros.evaluation.campaign import Job, Outcome
+from hat_ros.evaluation.campaign import GRAPH, Job, Outcome
 from hat_ros.evaluation.tables import Column, Table
+from hat_ros.methods import MODES
 from hat_ros.source import SourceSpec
 
 GIVEN_MASKS = ("segmentation.backend=annotated",)
@@ -60,21 +63,55 @@ _STAGES = (
 )
 
 
+@dataclass(frozen=True)
+class Entry:
+    """A method as the table lists it.
+
+    Attributes:
+        name: what the table calls it, and part of its run folders' names.
+        mode: method, or ``graph``.
+        config: preset or YAML file.
+        settings: on top of it, ``key=value``.
+    """
+
+    name: str
+    mode: str
+    config: str
+    settings: tuple[str, ...] = ()
+
+    @classmethod
+    def parse(cls, text: str, default_config: str) -> Entry:
+        """Read ``NAME=MODE[:CONFIG][,KEY=VALUE ...]``.
+
+        Raises:
+            UsageError: malformed, an unknown mode, or a name that cannot be part of a folder's.
+        """
+        name, separator, rest = text.partition("=")
+        how, *settings = rest.split(",")
+        mode, _, config = how.partition(":")
+        if not separator or not name or "/" in name or any("=" not in setting for setting in settings):
+            raise UsageError(f"--method {text}: expected NAME=MODE[:CONFIG][,KEY=VALUE ...]")
+        if mode not in (*MODES, GRAPH):
+            raise UsageError(f"--method {text}: mode '{mode}' is unknown, choose one of {', '.join((*MODES, GRAPH))}")
+        return cls(name, mode, config or default_config, tuple(settings))
+
+
 def clips_named(texts: Sequence[str]) -> list[tuple[SourceSpec, tuple[str, ...]]]:
-    """Recordings with settings of their own: ``CLIP`` or ``CLIP@key=value[,key=value]``.
+    """Recordings, perhaps with settings of their own: ``CLIP`` or ``CLIP@key=value[,key=value]``; CLIP may hold ``*``.
 
     Raises:
         UsageError: there is no such file or folder.
     """
     clips = []
     for text in texts:
-        path, settings = Path(text), ()
-        if not path.exists() and "@" in text:
-            name, _, rest = text.rpartition("@")
-            path, settings = Path(name), tuple(rest.split(","))
-        if not path.exists():
-            raise UsageError(f"recording {path}: no such file or folder")
-        clips.append((SourceSpec(path.resolve()), settings))
+        pattern, settings = text, ()
+        if not Path(text).exists() and "@" in text:
+            pattern, _, rest = text.rpartition("@")
+            settings = tuple(rest.split(","))
+        found = [pattern] if Path(pattern).exists() else sorted(glob(pattern))
+        if not found:
+            raise UsageError(f"recording {pattern}: no such file or folder")
+        clips += [(SourceSpec(Path(path).resolve()), settings) for path in found]
     return clips
 
 
@@ -119,44 +156,53 @@ def bench_jobs(
     overrides: Sequence[str] = (),
     limit: int | None = None,
     externals: Mapping[str, str] | None = None,
+    methods: Sequence[Entry] = (),
 ) -> list[Job]:
     """The runs of a benchmark, clip by clip.
 
     Args:
         clips: recordings, each with settings of its own.
-        modes: methods.
+        modes: methods under their own names.
         masks: ``own`` (the preset's segmentation) and/or ``given`` (the recording's masks).
         starts: cold-start offsets in frames.
         config: preset or YAML file.
         overrides: settings for all runs.
         limit: at most this many frames per run.
         externals: name of a method that is not ours -> its file of poses, ``{clip}`` standing for the clip's name.
+        methods: methods under other names, each with a configuration of its own.
 
     Raises:
-        UsageError: two clips have the same name; a file of poses is missing, or its method has the name of ours.
+        UsageError: two clips, or two methods, have the same name; a file of poses is missing.
     """
+    entries = [*(Entry(mode, mode, config) for mode in modes), *methods]
+    names = [entry.name for entry in entries] + list(externals or {})
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise UsageError(f"two methods are called {', '.join(sorted(twice))}: choose another name for one of them")
     jobs: dict[str, Job] = {}
     for spec, own_settings in clips:
         # A clip that is meant to be run with its own masks has no other.
         for mask in ("given",) if set(GIVEN_MASKS) <= set(own_settings) else masks:
             for start in starts:
-                for mode in modes:
-                    name = f"{spec.name}-{mode}-{mask}-{start}"
+                for entry in entries:
+                    name = f"{spec.name}-{entry.name}-{mask}-{start}"
                     if name in jobs:
                         raise UsageError(f"two recordings are called {spec.name}: rename one of them")
-                    settings = (*overrides, *own_settings, *(GIVEN_MASKS if mask == "given" else ()))
-                    labels = {"group": spec.group, "clip": spec.name, "masks": mask, "start": str(start), "mode": mode}
-                    jobs[name] = Job(name, spec, mode, config, settings, start, limit, labels)
+                    given = GIVEN_MASKS if mask == "given" else ()
+                    settings = (*overrides, *entry.settings, *own_settings, *given)
+                    labels = _labels(spec, mask, start, entry.name) | {"method": entry.mode}
+                    jobs[name] = Job(name, spec, entry.mode, entry.config, settings, start, limit, labels)
         for start in starts:
             for method, pattern in (externals or {}).items():
                 name, poses = f"{spec.name}-{method}-{start}", Path(pattern.replace("{clip}", spec.name)).resolve()
-                if method in modes:
-                    raise UsageError(f"--poses {method}: a method of that name runs already, choose another name")
                 if not poses.exists():
                     raise UsageError(f"--poses {method}: {poses} does not exist; use {{clip}} for the clip's name")
-                labels = {"group": spec.group, "clip": spec.name, "masks": "-", "start": str(start), "mode": method}
+                labels = _labels(spec, "-", start, method)
                 jobs[name] = Job(name, spec, method, config, (), start, limit, labels, poses)
     return list(jobs.values())
+
+
+def _labels(spec: SourceSpec, masks: str, start: int, name: str) -> dict[str, str]:
+    return {"group": spec.group, "clip": spec.name, "masks": masks, "start": str(start), "mode": name}
 
 
 def bench_table(outcomes: Sequence[Outcome]) -> Table:
@@ -176,7 +222,10 @@ def group_table(outcomes: Sequence[Outcome]) -> Table:
     for outcome in outcomes:
         if outcome.figures is not None:
             groups.setdefault(tuple(outcome.job.labels[key] for key in keys), []).append(outcome)
-    rows = [{**dict(zip(keys, group, strict=True)), **_pooled(members)} for group, members in groups.items()]
+    rows = [
+        {**dict(zip(keys, group, strict=True)), "method": members[0].job.labels.get("method"), **_pooled(members)}
+        for group, members in groups.items()
+    ]
     columns = (
         Column("group", "group"),
         *_WHERE[1:],

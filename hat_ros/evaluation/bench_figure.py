@@ -47,7 +47,7 @@ def _panel(axis: Axes, rows: Sequence[dict[str, Any]]) -> None:
     labels = [_label(row, rows) for row in rows]
     x = np.arange(len(rows))
     mean, sd, fps = (np.array([_number(row.get(key)) for row in rows]) for key in ("E_p_mean", "E_p_sd", "fps"))
-    axis.bar(x, mean, color=[_COLOR.get(row["mode"], _BASELINE_COLOR) for row in rows], width=0.65)
+    axis.bar(x, mean, color=[_COLOR.get(row.get("method"), _BASELINE_COLOR) for row in rows], width=0.65)
     has_sd = np.isfinite(mean) & np.isfinite(sd)
     upwards = [np.zeros(np.count_nonzero(has_sd)), sd[has_sd]]
     axis.errorbar(x[has_sd], mean[has_sd], yerr=upwards, fmt="none", ecolor="#444444", capsize=3, linewidth=1)
@@ -60,7 +60,9 @@ def _panel(axis: Axes, rows: Sequence[dict[str, Any]]) -> None:
     axis.margins(y=0.12)
     axis.set_ylim(bottom=0)
     speed = axis.twinx()
-    speed.plot(x, fps, "D", color=_DIAMOND_COLOR, markersize=6, markeredgecolor="black", markeredgewidth=0.6)
+    for at, rate, row in zip(x, fps, rows, strict=True):
+        size = 8 if row.get("method") in _COLOR else 5
+        speed.plot(at, rate, "D", color=_DIAMOND_COLOR, markersize=size, markeredgecolor="black", markeredgewidth=0.6)
     speed.set_ylabel("frames/s", fontsize=9, color=_DIAMOND_COLOR)
     fastest = np.nanmax(fps) if np.isfinite(fps).any() else 1.0
     speed.set_ylim(0, 1.15 * fastest)

@@ -13,6 +13,7 @@ from hat_ros.datasets.models import write_model
 from hat_ros.errors import MissingDependencyError, RunError, UsageError
 from hat_ros.evaluation import campaign
 from hat_ros.evaluation.bench import (
+    Entry,
     bench_jobs,
     bench_table,
     clips_named,
@@ -91,6 +92,36 @@ def test_one_clip_may_have_settings_of_its_own(clips):
     jobs = bench_jobs(named, ["hat"], ["own"], [0], "default")
     assert jobs[0].overrides == ()
     assert jobs[1].overrides == ("slam.masked=false", "keyframes.gap_frames=2")
+
+
+def test_patterns_name_many_clips_with_the_same_settings(clips):
+    named = clips_named([f"{Path(clips[0]).parent}/*@slam.masked=false"])
+    assert [(spec.name, settings) for spec, settings in named if spec.path.is_dir()] == [
+        ("one", ("slam.masked=false",)),
+        ("two", ("slam.masked=false",)),
+    ]
+
+
+def test_methods_have_names_and_configurations_of_their_own(clips):
+    told = ("Mega-HAT=hat:mega_hat", "GigaPose=independent:mega_hat,hypotheses.backend=gigapose", "Ours=hat")
+    methods = [Entry.parse(text, "default") for text in told]
+    jobs = bench_jobs(clips_named(clips[:1]), ["srt3d"], ["own"], [0], "default", methods=methods)
+    found = {job.labels["mode"]: job for job in jobs}
+    assert [*found] == ["srt3d", "Mega-HAT", "GigaPose", "Ours"]
+    assert (found["Mega-HAT"].mode, found["Mega-HAT"].config) == ("hat", "mega_hat")
+    assert found["GigaPose"].overrides == ("hypotheses.backend=gigapose",)
+    assert found["Ours"].config == "default"
+
+
+@pytest.mark.parametrize("text", ["Mega-HAT", "=hat", "a/b=hat", "x=magic", "x=hat:default,gap"])
+def test_malformed_methods_are_refused(text):
+    with pytest.raises(UsageError, match="--method"):
+        Entry.parse(text, "default")
+
+
+def test_two_methods_of_one_name_are_refused(clips):
+    with pytest.raises(UsageError, match="two methods are called hat"):
+        bench_jobs(clips_named(clips), ["hat"], ["own"], [0], "default", methods=[Entry("hat", "hat", "mega_hat")])
 
 
 def test_suite_clips_come_with_the_settings_of_their_group(tmp_path):
