@@ -153,8 +153,9 @@ class FeatureSlam:
             self._met_prior = True
             window.try_prior()
             return
-        # A trusted CAD surface leaves little room for another solution: half as often.
-        turn, phase = divmod(window.number[-1], _RIVAL_PERIOD * (2 if window.trusts_prior else 1))
+        # A trusted CAD surface leaves little room for another solution, nor does the depth of a whole scene.
+        certain = window.trusts_prior or not self._masked
+        turn, phase = divmod(window.number[-1], _RIVAL_PERIOD * (2 if certain else 1))
         if phase == 0 and len(window) > 3:
             if window.trusts_prior and turn % 2 == 0:
                 window.challenge_prior()
