@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from hat_ros.config import HatConfig
     from hat_ros.source import SourceSpec
 
-FORMATS = ("sequence", "spark", "shirt", "swisscube", "bop")
+FORMATS = ("sequence", "spark", "shirt", "swisscube", "bop", "ycbv")
 
 Commands = Any  # argparse's sub-parser action has no public name
 

@@ -27,10 +27,16 @@ from hat_ros.errors import DatasetError
 MILLIMETRE = 1e-3
 TARGETS_FILE = "test_targets_bop19.json"
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+# Objects of YCB-Video that some rotation, or one of their texture, maps onto themselves: not scored by the paper.
+_SYMMETRIC_YCBV = (1, 13, 16, 18, 19, 20, 21)
 
 
 def open_bop(
-    root: Path, model: Path | None = None, sequences: Collection[str] = (), targets_only: bool = False
+    root: Path,
+    model: Path | None = None,
+    sequences: Collection[str] = (),
+    targets_only: bool = False,
+    without: Collection[int] = (),
 ) -> Iterator[ImageRecording]:
     """Recordings of a BOP data set's test split, one per scene and object.
 
@@ -39,6 +45,7 @@ def open_bop(
         model: unused here: the models come with the data set.
         sequences: names ``SCENE`` or ``SCENE_objID`` to keep, empty = all.
         targets_only: keep truth only at the images that ``test_targets_bop19.json`` lists, the published targets.
+        without: object ids that are left out.
 
     Raises:
         DatasetError: missing folders, malformed files.
@@ -54,7 +61,7 @@ def open_bop(
     listed = _targets(root / TARGETS_FILE) if targets_only else None
     for scene in scenes:
         gt, calibration = read_json(scene / "scene_gt.json"), read_json(scene / "scene_camera.json")
-        for object_id in sorted(_objects(gt, scene)):
+        for object_id in sorted(_objects(gt, scene) - set(without)):
             name = f"{scene.name}_obj{object_id}"
             if sequences and name not in sequences and scene.name not in sequences:
                 continue
@@ -63,6 +70,16 @@ def open_bop(
                 raise DatasetError(f"{mesh}: CAD model of object {object_id} in scene {scene.name} is missing")
             recording = read_scene(scene, name, mesh, gt, calibration, object_id, listed)
             yield replace(recording, scene=(int(scene.name), object_id) if scene.name.isdigit() else None)
+
+
+def open_ycbv(root: Path, model: Path | None = None, sequences: Collection[str] = ()) -> Iterator[ImageRecording]:
+    """YCB-Video as the paper scores it: whole videos, truth at the BOP-19 targets of the non-symmetric objects alone.
+
+    Arguments and errors as of :func:`open_bop`; objects of a scene without any target are left out.
+    """
+    for recording in open_bop(root, model, sequences, targets_only=True, without=_SYMMETRIC_YCBV):
+        if recording.truth():
+            yield recording
 
 
 def read_scene(

@@ -34,6 +34,7 @@ FORMATS = {
     "shirt": "hat_ros.datasets.shirt:open_shirt",
     "swisscube": "hat_ros.datasets.swisscube:open_swisscube",
     "bop": "hat_ros.datasets.bop:open_bop",
+    "ycbv": "hat_ros.datasets.bop:open_ycbv",
 }
 
 Progress = Callable[[str, int, int], None]
@@ -67,7 +68,8 @@ def open_dataset(
         found = True
         yield recording
     if not found:
-        raise DatasetError(f"{root}: no sequence named {', '.join(sequences)}")
+        named = f"named {', '.join(sequences)}" if sequences else "that could be scored"
+        raise DatasetError(f"{root}: no sequence {named}")
 
 
 def import_dataset(

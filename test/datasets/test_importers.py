@@ -398,6 +398,18 @@ def test_bop_truth_can_be_kept_at_the_published_targets_only(bop_root):
     assert recordings["000048_obj2"].truth() == {} and len(recordings["000048_obj2"]) == 3
 
 
+def test_ycbv_is_scored_at_the_targets_of_objects_without_symmetry(bop_root):
+    (recording,) = open_dataset("ycbv", bop_root)
+    assert recording.name == "000048_obj5", "the other object has no target"
+    assert list(recording.truth()) == [stamp_of(1)] and len(recording) == 3
+    ground_truth = bop_root / "test" / "000048" / "scene_gt.json"
+    ground_truth.write_text(ground_truth.read_text().replace('"obj_id": 5', '"obj_id": 13'))
+    targets = bop_root / "test_targets_bop19.json"
+    targets.write_text(targets.read_text().replace('"obj_id": 5', '"obj_id": 13'))
+    with pytest.raises(DatasetError, match="no sequence"):
+        list(open_dataset("ycbv", bop_root))
+
+
 @pytest.mark.parametrize(
     ("file", "change", "says"),
     [
