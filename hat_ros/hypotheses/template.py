@@ -54,6 +54,8 @@ _SELECTION_TOLERANCE_PX = 1.0
 _POOR_SCORE = -6.0
 # Score short of the best at which no sunlight helps.
 _LIGHT_MATTERS = 14.0
+# The sun is fitted to so many more matches of brightness than are refined.
+_MATCHED_PER_REFINED = 2
 # Candidates of different searches closer than this are the same.
 _SAME_DEG = 8.0
 _FIRST = Schedule((0, 0, 0, 0), (1, 1, 1, 1), (6, 4, 3, 2))
@@ -157,9 +159,12 @@ class TemplateHypotheses:
         matches = match_light(
             bank, light, frame.camera, options.n_coarse_lit, options.separation_deg, self._target.center_m
         )
+        mask = scorer.field.mask
+        at_a_glance = np.array([self._sun.glance(T, frame, mask) for T in matches.T_cam_target])
+        promising = np.argsort(at_a_glance, kind="stable")[: _MATCHED_PER_REFINED * options.n_refined_lit]
         found = []
-        for T in matches.T_cam_target:
-            sunlight = self._sun.match(T, frame, scorer.field.mask)
+        for T in matches.T_cam_target[promising]:
+            sunlight = self._sun.match(T, frame, mask)
             if sunlight is not None:
                 found.append((sunlight.distance, Start(T, sunlight.to_sun_cam)))
         found.sort(key=lambda pair: pair[0])

@@ -36,6 +36,21 @@ def test_the_true_pose_explains_light_and_shadow_best(viewer, matcher, sun, seed
         assert truth.distance < matcher.match(turned(T_true, rotvec), frame, mask).distance
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_glance_tells_the_true_pose_from_turned_ones(viewer, matcher, seed):
+    T_true = random_pose(np.random.default_rng(seed), viewer.target)
+    frame, mask = sunlit_picture(viewer.target, T_true, SUNS["beside"])
+    turned_away = [turned(T_true, rotvec) for rotvec in ((np.pi, 0, 0), (0, np.pi, 0), (0, 0, np.pi))]
+    assert matcher.glance(T_true, frame, mask) < min(matcher.glance(T, frame, mask) for T in turned_away)
+
+
+def test_a_glance_past_the_target_sees_nothing(viewer, matcher):
+    T = random_pose(np.random.default_rng(2), viewer.target)
+    frame, mask = sunlit_picture(viewer.target, T, SUNS["beside"])
+    T[2, 3] = -5.0
+    assert matcher.glance(T, frame, mask) == 1.0
+
+
 def test_the_sun_is_found_where_it_is(viewer, matcher):
     errors = []
     for seed in range(6):
