@@ -101,20 +101,34 @@ class Pipeline:
         return self._method.causal
 
     def run(self, frames: Iterable[Frame | FrameError]) -> Iterator[Processed]:
-        """Process frames, answers in order; those with a late stamp or malformed are counted in ``rejected``."""
+        """Process frames, answers in order; those with a late stamp or malformed are counted in ``rejected``.
+
+        An error of the recording is raised after the answers to what was read before it.
+        """
         in_flight: deque[Future[Processed]] = deque()
         clock = _Clock()
         with closing(_ReadAhead(frames)) as attempts, ThreadPoolExecutor(self._credits, "frame") as threads:
             try:
                 admitted = self._admitted(attempts)
-                while True:
-                    while self._admission.has_credit and (entry := next(admitted, None)) is not None:
-                        in_flight.append(threads.submit(self._process, *entry))
-                    if not in_flight:
-                        return
+                failure: Exception | None = None
+
+                def fill() -> None:
+                    nonlocal failure
+                    try:
+                        while self._admission.has_credit and (entry := next(admitted, None)) is not None:
+                            in_flight.append(threads.submit(self._process, *entry))
+                    except Exception as error:  # of reading: what was read before comes first
+                        failure = error
+
+                fill()
+                while in_flight:
                     done = in_flight.popleft().result()
                     self._admission.answered(done.frame.stamp_ns)
-                    yield replace(done, **clock.lap())
+                    answer = replace(done, **clock.lap())
+                    fill()  # now: what the caller does with the answer takes its time
+                    yield answer
+                if failure is not None:
+                    raise failure
             finally:
                 self._turnstiles.close(0)
 

@@ -77,7 +77,9 @@ def test_frames_are_read_by_one_thread_and_an_error_of_reading_ends_the_run():
 
     done = []
     with pytest.raises(BagError, match="breaks off"):
-        done.extend(Pipeline(ScriptedMethod(), masks_given=False).run(recording()))
+        for answer in Pipeline(ScriptedMethod(), masks_given=False, credits=2).run(recording()):
+            done.append(answer.frame.stamp_ns)
+    assert done == [stamp(i) for i in range(3)]
     assert len(threads) == 1
     threads.clear()
     abandoned = Pipeline(ScriptedMethod(), masks_given=False).run(recording())
