@@ -6,6 +6,7 @@ torch to run the default preset. To add one: write the class, add one line to :d
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Protocol
 
@@ -68,6 +69,20 @@ BACKENDS: dict[str, dict[str, str]] = {
         "droid": "hat_ros.slam.droid:DroidSlam",
     },
 }
+
+# slam backend -> motion of a whole clip in hindsight, for the offline reference; others keep what they said.
+OFFLINE_MOTIONS: dict[str, str] = {"droid": "hat_ros.slam.droid:offline_motions"}
+
+OfflineMotions = Callable[[HatConfig, Sequence[tuple[Frame, Detection | None]]], list[Motion]]
+
+
+def offline_motions_of(config: HatConfig) -> OfflineMotions | None:
+    """What the motion backend makes of a whole clip; None if it has nothing to add to its causal answers."""
+    where = OFFLINE_MOTIONS.get(config.slam.backend)
+    if where is None:
+        return None
+    module_name, function_name = where.split(":")
+    return getattr(import_module(module_name), function_name)
 
 
 def create_backend(stage: str, config: HatConfig, target: Target) -> Segmenter | HypothesisBackend | MotionEstimator:

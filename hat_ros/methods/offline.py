@@ -1,13 +1,15 @@
 """The offline reference: what hindsight makes of the observations of HAT. Never causal.
 
-After the paper's "Causal and Offline Performance Comparison": the decoder's path traced back, one verdict of the gate
-over the whole sequence, all poses optimised jointly, then dense refinement of every frame, which never leaves the basin
-of the anchors. Here the refined poses are measurements, as they are for the causal method: a last joint optimisation
-ties them to each other by the motion. Without refinement in the configuration the poses of the anchors stand.
+After the paper's "Causal and Offline Performance Comparison": motion by global bundle adjustment where the backend can
+(DROID-SLAM), the decoder's path traced back, one verdict of the gate over the whole sequence, all poses optimised
+jointly, then dense refinement of every frame, which never leaves the basin of the anchors. Here the refined poses are
+measurements, as they are for the causal method: a last joint optimisation ties them to each other by the motion.
+Without refinement in the configuration the poses of the anchors stand.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -19,9 +21,11 @@ from hat_ros.core.offline import smooth_measured, solve_offline
 from hat_ros.core.refined import is_supported, quality
 from hat_ros.methods.causal import Hat
 from hat_ros.refinement import create_refiner
+from hat_ros.slam.stage import suppress_background
+from hat_ros.stages import offline_motions_of
 from hat_ros.target import Target
 from hat_ros.tracker import Step
-from hat_ros.types import Camera, Detection, Estimate, Float, Frame, Refined, TrackState
+from hat_ros.types import Camera, Detection, Estimate, Float, Frame, Motion, Refined, TrackState
 
 # The paper's dense refinement rejects what lies further than this from the anchors.
 _SAME_BASIN_DEG = 90.0
@@ -38,24 +42,25 @@ class Offline:
         self._config = config
         self._hat = Hat(config, target)
         self._refiner = create_refiner(config, target)
+        self._offline_motions = offline_motions_of(config)
         self._steps: list[Step] = []
-        self._images: list[_StoredImage] = []
+        self._images = _StoredClip(config.slam.masked)
         self.stages = self._hat.stages
 
     def step(self, frame: Frame) -> Step:
         """Observe; the estimate in the returned step is the causal one."""
         step = self._hat.step(frame)
         self._steps.append(replace(step, detection=None))
-        if self._refiner is not None:
-            self._images.append(_StoredImage.of(frame, step.detection))
+        if self._refiner is not None or self._offline_motions is not None:
+            self._images.append(frame, step.detection)
         return step
 
     def finish(self) -> list[Estimate]:
-        """Decode, align, optimise jointly; refine on the images, and optimise again."""
+        """Adjust globally, decode, align, optimise jointly; refine on the images, and optimise again."""
         steps = self._steps
         if not steps:
             return []
-        motions = [step.motion for step in steps]
+        motions = self._motions()
         result = solve_offline([step.candidates for step in steps], motions, self._config)
         T_final, covariances = result.T_cam_target, [_NO_COVARIANCE] * len(steps)
         if self._refiner is not None:
@@ -78,6 +83,13 @@ class Offline:
                 )
             )
         return estimates
+
+    def _motions(self) -> list[Motion]:
+        """By hindsight where the backend has any; not for a clip on which it never got going."""
+        causal = [step.motion for step in self._steps]
+        if self._offline_motions is None or not any(motion.valid for motion in causal):
+            return causal
+        return self._offline_motions(self._config, self._images)
 
     def _measured(self, index: int, T_decided: Float) -> tuple[Float, Float]:
         """The pose (4, 4) that the image of a frame supports near the decided one, and its covariance; NaN: none.
@@ -105,12 +117,37 @@ class Offline:
         return (best.T_cam_target, best.covariance) if is_supported(best, config) else nothing
 
     def _refined(self, index: int, T_cam_target: Float) -> Refined | None:
-        frame, detection = self._images[index].load()
+        frame, detection = self._images.load(index)
         return self._refiner.refine(frame, detection, T_cam_target)
 
 
 def _apart_deg(T_a: Float, T_b: Float) -> float:
     return float(np.degrees(lie.angle_between(T_a[:3, :3], T_b[:3, :3])))
+
+
+class _StoredClip(Sequence[tuple[Frame, "Detection | None"]]):
+    """All frames in little memory; as a sequence they are what the motion stage's backend sees."""
+
+    def __init__(self, masked: bool) -> None:
+        self._masked = masked
+        self._images: list[_StoredImage] = []
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def __getitem__(self, index: int) -> tuple[Frame, Detection | None]:
+        frame, detection = self._images[index].load()
+        if self._masked and detection is not None:
+            frame = replace(frame, rgb=suppress_background(frame.rgb, detection.mask))
+        return frame, detection
+
+    def append(self, frame: Frame, detection: Detection | None) -> None:
+        """Keep one more."""
+        self._images.append(_StoredImage.of(frame, detection))
+
+    def load(self, index: int) -> tuple[Frame, Detection | None]:
+        """One frame as it came."""
+        return self._images[index].load()
 
 
 @dataclass(frozen=True)

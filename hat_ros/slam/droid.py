@@ -120,15 +120,16 @@ def offline_motions(
     """
     slam = DroidSlam(config, None, model)
     used = [not config.slam.masked or (d is not None and bool(d.mask.any())) for _, d in clip]
-    frames = [frame for (frame, _), use in zip(clip, used, strict=True) if use]
-    if not frames:
-        return [Motion.none() for _ in clip]
+    indices = np.flatnonzero(used)
+    if not len(indices):
+        return [Motion.none() for _ in used]
 
     def images() -> Iterator[tuple[int, torch.Tensor]]:
-        for frame in frames:
+        for index in indices:  # one at a time: a clip need not fit into memory
+            frame, _ = clip[index]
             yield frame.stamp_ns, torch.from_numpy(prepare(frame, config.slam.droid)[0]).to(slam._device)
 
-    image, intrinsics = prepare(frames[0], config.slam.droid)
+    image, intrinsics = prepare(clip[indices[0]][0], config.slam.droid)
     frontend = slam._new_frontend(image, intrinsics, keep_all=True)
     for stamp_ns, image_bgr in images():
         frontend.track(stamp_ns, image_bgr)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scripted_backends
 from scripted import stamp
 from scripted_backends import index_of, true_pose
 
@@ -11,7 +12,7 @@ from hat_ros.datasets.models import build_target
 from hat_ros.errors import UsageError
 from hat_ros.methods import MODES, create_method
 from hat_ros.render import create_renderer
-from hat_ros.stages import BACKENDS
+from hat_ros.stages import BACKENDS, OFFLINE_MOTIONS
 from hat_ros.tracker import HatTracker
 from hat_ros.types import Camera, Frame, TrackState
 
@@ -139,6 +140,15 @@ def test_hindsight_loses_to_the_causal_pose_nowhere_that_matters(frames, target)
     steps, method = run("offline", frames, target, refinement={"enabled": True})
     causal_deg, offline_deg = errors_deg([step.estimate for step in steps]), errors_deg(method.finish())
     assert offline_deg.mean() <= causal_deg.mean()
+
+
+def test_offline_takes_the_motion_of_hindsight_where_the_backend_has_one(frames, target, monkeypatch):
+    monkeypatch.setitem(OFFLINE_MOTIONS, "knowing", "scripted_backends:knowing_in_hindsight")
+    monkeypatch.setitem(BACKENDS["slam"], "knowing", "scripted_backends:ReversedSlam")
+    steps, method = run("offline", frames, target, slam={"backend": "knowing"})
+    assert errors_deg([step.estimate for step in steps][6:]).max() > 5.0, "reversed motion misleads the causal pose"
+    assert (errors_deg(method.finish()) < 2.0).all()
+    assert scripted_backends.seen_in_hindsight == [(frame.stamp_ns, 0) for frame in frames], "background suppressed"
 
 
 def test_offline_of_nothing_is_nothing(target):

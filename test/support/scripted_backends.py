@@ -46,3 +46,20 @@ class KnowingSlam:
 
     def reset(self) -> None:
         pass
+
+
+class ReversedSlam(KnowingSlam):
+    """Turns the wrong way, as a relief seen with its depth reversed does."""
+
+    def update(self, frame, detection, prior) -> Motion:
+        T_slam_cam = lie.inverse(true_pose(-index_of(frame.stamp_ns)))
+        return Motion(True, 0, lie.row_from_matrix(T_slam_cam))
+
+
+seen_in_hindsight: list[tuple[int, int]] = []
+
+
+def knowing_in_hindsight(config, clip) -> list[Motion]:
+    """The right motion of a whole clip; notes each stamp and the brightest pixel beside the mask."""
+    seen_in_hindsight[:] = [(frame.stamp_ns, int(frame.rgb[~detection.mask].max())) for frame, detection in clip]
+    return [KnowingSlam(config, None).update(frame, detection, None) for frame, detection in clip]
