@@ -142,12 +142,14 @@ class PosePrior:
         pose_row: (7,) pose ``T_cam_target`` extrapolated to this frame at constant rate.
         fused_row: (7,) the fused pose at ``stamp_ns`` itself.
         healthy: the fused state there was TRACKING.
+        supported: mask and contour there agreed with the pose: its silhouette is right even where the basin is open.
     """
 
     stamp_ns: int
     pose_row: Float
     fused_row: Float
     healthy: bool
+    supported: bool
 
     @cached_property
     def T_cam_target(self) -> Float:

@@ -69,7 +69,13 @@ class PriorBuffer:
             return None
         stamps_ns, T_cam_target = _unbroken_run(past)
         pose_row = extrapolate(stamps_ns, T_cam_target, stamp_ns)
-        return PosePrior(newest.stamp_ns, pose_row, newest.pose_row, newest.state == TrackState.TRACKING)
+        return PosePrior(
+            newest.stamp_ns,
+            pose_row,
+            newest.pose_row,
+            healthy=newest.state == TrackState.TRACKING,
+            supported=newest.gap_frames == 0,
+        )
 
     def _past(self, stamp_ns: int) -> dict[int, Estimate | None]:
         """Frames at least ``delay_frames`` before the given one, oldest first, at most HISTORY_FRAMES."""

@@ -47,16 +47,17 @@ class ClassicalSegmenter:
     def update(self, frame: Frame, prior: PosePrior | None) -> Detection | None:
         """Find the target in one frame; None rather than a wrong mask."""
         silhouette = self._silhouette(frame, prior)
-        trusted = prior is not None and prior.healthy
+        supported = prior is not None and prior.supported
+        certain = prior is not None and prior.healthy  # what is dark is added only where the basin is beyond doubt
         mask, black, regions = None, False, []
         if dark_border_share(frame.rgb) >= self._config.sky_border_share:
             measured = measure_sky(frame.rgb)
             black = measured.border_share >= self._config.sky_border_share
             regions = lit_regions(measured) if black else []
         if regions:
-            mask = self._lit.find(measured, regions, self._masks[1], silhouette if trusted else None)
+            mask = self._lit.find(measured, regions, self._masks[1], silhouette if certain else None)
         if mask is None and (regions or not black):
-            mask = self._textured.find(frame.rgb, self._masks, silhouette, trusted)
+            mask = self._textured.find(frame.rgb, self._masks, silhouette, supported)
         if mask is not None and not mask.any():
             mask = None
         self._masks = (self._masks[1], mask)

@@ -29,6 +29,7 @@ _BENEFIT_OF_DOUBT = 0.1  # less plausibility keeps a mask than finds one
 _CLEARLY_BETTER = 0.025  # plausibility by which another explanation must beat a predicted one
 _MAX_RETRY_FRAMES = 8
 _CHECK_UNAIDED_FRAMES = 3  # between checks of a mask that no prior holds in place; more while they find the same
+_STEADY = 0.87  # overlap of a tracked mask with its moved predecessor below which something happened
 
 
 class TexturedBackground:
@@ -47,6 +48,7 @@ class TexturedBackground:
         self._contrast = 0.0  # of the tracked outline, slowly following
         self._since_check = 0
         self._check_every = _CHECK_UNAIDED_FRAMES
+        self._found_anew = False  # the previous mask: the one before it tells nothing about its motion
         self._failures = 0
         self._wait = 0
 
@@ -67,11 +69,14 @@ class TexturedBackground:
         """
         self._search.push(rgb)
         if masks[1] is not None:
-            tracked, aided = self._track(rgb, masks[1], shift_between(*masks), silhouette, trusted)
+            shift_xy = (0, 0) if self._found_anew else shift_between(*masks)
+            self._found_anew = False
+            tracked, aided = self._track(rgb, masks[1], shift_xy, silhouette, trusted)
             self._since_check += 1
-            due = self._since_check >= (self._config.check_interval_frames if aided else self._check_every)
             if tracked is not None:
-                return self._cross_check(rgb, tracked, aided) if due else tracked
+                due = self._since_check >= (self._config.check_interval_frames if aided else self._check_every)
+                due = due or overlap(tracked, moved(masks[1], *shift_xy)) < _STEADY
+                return self._cross_check(rgb, tracked, aided, silhouette) if due else tracked
         if self._wait > 0:
             self._wait -= 1
             return None
@@ -86,6 +91,7 @@ class TexturedBackground:
     def _adopt(self, found: Found) -> Mask:
         """Go on from what a search found."""
         self._since_check = 0
+        self._found_anew = True
         self._models = found.models
         self._contrast = found.contrast
         return found.mask
@@ -94,9 +100,6 @@ class TexturedBackground:
         self, rgb: NDArray[np.uint8], mask: Mask, shift_xy: tuple[int, int], silhouette: Mask | None, trusted: bool
     ) -> tuple[Mask | None, bool]:
         """Follow the previous mask into this frame; the predicted silhouette helps while the two agree.
-
-        A prediction that nobody vouches for yet is tried as well: it is followed where it makes the mask more
-        plausible and its outline no less clear.
 
         Returns:
             The mask, None when it was lost, and whether a trusted prediction helped.
@@ -110,25 +113,43 @@ class TexturedBackground:
         if silhouette is not None:
             u, v, a, b = cv2.boundingRect(silhouette)
             box = (min(box[0], u), min(box[1], v), max(box[2], u + a), max(box[3], v + b))
-        aided = silhouette is not None and trusted
         window = Window.around(rgb, box, 2.5 * margin, self._config.work_side_px)
         if window is None:
             return None, False
-        seeds = [window.reduce(mask, shift_xy)]
-        tried = self._models.copy()
-        if silhouette is None:
-            best = self._cut(window, seeds, margin, self._models)
-        else:
-            with_silhouette = [window.reduce(silhouette), *seeds]
-            best = self._cut(window, with_silhouette if trusted else seeds, margin, self._models)
-            if not trusted:
-                other = self._cut(window, with_silhouette, margin, tried)
-                if other is not None and (best is None or self._is_better(other, best)):
-                    best, self._models = other, tried
+        previous = window.reduce(mask, shift_xy)
+        predicted = None if silhouette is None else window.reduce(silhouette)
+        best, aided = self._best_cut(window, previous, predicted, trusted, margin)
         if best is None:
             return None, aided
         self._contrast += _CONTRAST_GAIN * (best.contrast - self._contrast)
         return at_full_resolution(rgb, window, best.mask), aided
+
+    def _best_cut(
+        self, window: Window, previous: Mask, predicted: Mask | None, trusted: bool, margin: float
+    ) -> tuple[region.ClearCut | None, bool]:
+        """Cut from the reduced previous mask, and from the reduced predicted silhouette besides.
+
+        Without the prediction the cut has less freedom, with it it cannot drift. A trusted prediction is followed,
+        unless it leads away from the previous mask to nothing more plausible; one that nobody vouches for where it
+        makes the mask more plausible and its outline no less clear.
+
+        Returns:
+            The cut, None when both failed, and whether a trusted prediction helped.
+        """
+        alone = [previous]
+        if predicted is None:
+            return self._cut(window, alone, margin, self._models), False
+        both, tried = [predicted, previous], self._models.copy()
+        best = self._cut(window, both if trusted else alone, margin, self._models)
+        if trusted and best is not None and overlap(best.mask, previous) >= _STEADY:
+            return best, True
+        other = self._cut(window, alone if trusted else both, margin, tried)
+        if other is not None:
+            replaces = best is None or (not self._is_better(best, other) if trusted else self._is_better(other, best))
+            if replaces:
+                self._models = tried
+                return other, False
+        return best, trusted
 
     def _cut(
         self, window: Window, seeds: list[Mask], margin: float, models: region.ColorModels
@@ -149,11 +170,11 @@ class TexturedBackground:
         gain = self._bank.overlap(other.mask.astype(bool)) - self._bank.overlap(than.mask.astype(bool))
         return other.contrast >= than.contrast and gain >= OPEN_BETTER
 
-    def _cross_check(self, rgb: NDArray[np.uint8], tracked: Mask, aided: bool) -> Mask | None:
+    def _cross_check(self, rgb: NDArray[np.uint8], tracked: Mask, aided: bool, silhouette: Mask | None) -> Mask | None:
         """Compare a tracked mask with what a search from nothing finds; keep the more plausible one.
 
         A mask held in place by a prediction is given up only for one that means something else; while a glance finds
-        the same, nothing more is searched.
+        the same, nothing more is searched. What a prediction speaks for, trusted or not, must be clearly beaten.
         """
         self._since_check = 0
         if aided and self._search.confirms(tracked):
@@ -165,6 +186,10 @@ class TexturedBackground:
         if aided and agreement >= AGREEMENT:
             return tracked
         plausibility, required = self._search.judge(tracked)
-        if found is not None and found.plausibility > plausibility + (_CLEARLY_BETTER if aided else 0.0):
-            return self._adopt(found)
+        if found is not None:
+            expected = aided or (
+                silhouette is not None and overlap(tracked, silhouette) > overlap(found.mask, silhouette)
+            )
+            if found.plausibility > plausibility + (_CLEARLY_BETTER if expected else 0.0):
+                return self._adopt(found)
         return tracked if aided or plausibility >= required - _BENEFIT_OF_DOUBT else None

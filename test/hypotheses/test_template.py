@@ -102,7 +102,7 @@ def test_a_healthy_prior_is_a_candidate(backend, target):
     T_true = random_pose(np.random.default_rng(8), target)
     frame, mask = picture(target, T_true)
     row = lie.row_from_matrix(T_true)
-    prior = PosePrior(0, row, row, healthy=True)
+    prior = PosePrior(0, row, row, healthy=True, supported=True)
     turn, _ = pose_errors(backend.generate(frame, Detection(mask), prior).T_cam_target, T_true)
     assert turn.min() < 1
 

@@ -85,7 +85,7 @@ def frame(index, rgb, given_mask=None):
 
 def prior(T, healthy=True):
     row = lie.row_from_matrix(T)
-    return PosePrior(1, row, row, healthy)
+    return PosePrior(1, row, row, healthy, supported=healthy)
 
 
 def overlap(a, b):

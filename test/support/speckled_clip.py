@@ -71,7 +71,7 @@ class SpeckledClip:
         if turned is not None:
             T[:3, :3] = T[:3, :3] @ turned
         row = lie.row_from_matrix(T)
-        return PosePrior(self.frames[past].stamp_ns, row, row, healthy)
+        return PosePrior(self.frames[past].stamp_ns, row, row, healthy, supported=healthy)
 
 
 def speckled_clip(n_frames, backdrop=False, wall=False, **motion):
