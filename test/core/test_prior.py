@@ -1,5 +1,7 @@
 """Priors: only the distant past, whatever has arrived; constant rate; robust; bounded."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -104,6 +106,12 @@ def test_without_a_pose_at_the_delayed_frame_there_is_no_prior(state):
 def test_a_coasting_pose_is_a_prior_but_not_a_healthy_one():
     prior = _filled(20, at_16=_estimate(16, TrackState.COASTING)).before(_stamp(20))
     assert not prior.healthy
+    assert prior.supported
+
+
+def test_a_pose_that_no_image_spoke_for_supports_nothing():
+    held = replace(_estimate(16, TrackState.COASTING), gap_frames=2)
+    assert not _filled(20, at_16=held).before(_stamp(20)).supported
 
 
 def test_a_gap_or_a_jump_ends_the_history():

@@ -83,9 +83,9 @@ def frame(index, rgb, given_mask=None):
     return Frame(1_000_000_000 + 100_000_000 * index, rgb, Camera(CAMERA.K, width, height), given_mask)
 
 
-def prior(T, healthy=True):
+def prior(T, healthy=True, supported=None):
     row = lie.row_from_matrix(T)
-    return PosePrior(1, row, row, healthy, supported=healthy)
+    return PosePrior(1, row, row, healthy, healthy if supported is None else supported)
 
 
 def overlap(a, b):

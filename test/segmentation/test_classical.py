@@ -149,8 +149,9 @@ def test_a_small_target_before_broken_clouds_is_found_from_nothing(stage, scene,
     assert overlap(found.mask, truth) > 0.8
 
 
-def test_a_prior_keeps_the_mask(stage, scene):
-    assert (run(stage, scene, lambda T, i: prior(T) if i > 4 else None, frames=20) > 0.92).all()
+@pytest.mark.parametrize("healthy", [True, False])
+def test_a_supported_prior_keeps_the_mask(stage, scene, healthy):
+    assert (run(stage, scene, lambda T, i: prior(T, healthy, True) if i > 4 else None, frames=20) > 0.92).all()
 
 
 @pytest.mark.parametrize("healthy", [True, False])
