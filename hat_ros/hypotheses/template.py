@@ -56,6 +56,8 @@ _POOR_SCORE = -6.0
 _LIGHT_MATTERS = 14.0
 # The sun is fitted to so many more matches of brightness than are refined.
 _MATCHED_PER_REFINED = 2
+# With a healthy prior among the starts, fewer matches: they are there to contradict it, not to find the target.
+_TRACKED_DIVISOR = 2
 # Candidates of different searches closer than this are the same.
 _SAME_DEG = 8.0
 _FIRST = Schedule((0, 0, 0, 0), (1, 1, 1, 1), (6, 4, 3, 2))
@@ -110,16 +112,17 @@ class TemplateHypotheses:
             return Candidates.none()
         field = MaskField(mask)
         scorer = Scorer(self._viewer, frame, field, self._options.render_px)
-        starts = []
+        starts, n_coarse = [], self._options.n_coarse
         if prior is not None and prior.healthy:
             starts.append(Start(self._fitter.centred(prior.T_cam_target, frame.camera, field, scorer.luma)))
-        aligned = self._align(starts + self._coarse(whole_placement(mask), frame, field), frame, scorer)
+            n_coarse = max(1, n_coarse // _TRACKED_DIVISOR)
+        aligned = self._align(starts + self._coarse(whole_placement(mask), frame, field, n_coarse), frame, scorer)
         best = max(aligned, key=lambda a: a.score, default=None)
         if best is None or (best.score < _POOR_SCORE and not self._confirms(best.T_cam_target, prior)):
             # The mask is not the whole silhouette: look for those that it may be a part of.
             cut = detection.touches_border()
             placements = cut_placements(mask) if cut else partial_placements(mask)
-            aligned += self._align(self._coarse(placements, frame, field), frame, scorer)
+            aligned += self._align(self._coarse(placements, frame, field, self._options.n_coarse), frame, scorer)
         scored = self._finish(self._select(aligned), frame, scorer)
         leader = max(scored, key=lambda pair: pair[1], default=None)
         if scorer.dark_around and (leader is None or not self._confirms(leader[0], prior)):
@@ -136,15 +139,15 @@ class TemplateHypotheses:
     def reset(self) -> None:
         """Nothing to forget: every keyframe stands for itself."""
 
-    def _coarse(self, placements: list[Placement], frame: Frame, field: MaskField) -> list[Start]:
-        """Shape matches, pulled onto the mask's boundary."""
+    def _coarse(self, placements: list[Placement], frame: Frame, field: MaskField, n_coarse: int) -> list[Start]:
+        """The best shape matches, pulled onto the mask's boundary."""
         options = self._options
         matches = match_shape(
             self._bank,
             field.mask,
             placements,
             frame.camera,
-            options.n_coarse,
+            n_coarse,
             options.separation_deg,
             self._target.center_m,
         )
