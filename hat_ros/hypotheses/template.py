@@ -10,6 +10,7 @@
 Unless the best candidate is where the track expects it, more is tried. A mask that no view fits well is matched as
 part of a silhouette. Before a black sky the mask holds what is lit, which need not be the whole target: matches of
 brightness (``lit_bank``) compete as well, and of those only the sunlit part of the contour is compared with the mask.
+Where no candidate leads clearly after that, more shape matches are tried.
 """
 
 from __future__ import annotations
@@ -58,6 +59,9 @@ _LIGHT_MATTERS = 14.0
 _MATCHED_PER_REFINED = 2
 # With a healthy prior among the starts, fewer matches: they are there to contradict it, not to find the target.
 _TRACKED_DIVISOR = 2
+# A lead in log-likelihood that ends the search; without one, so many times the usual shape matches are tried.
+_CLEAR_LEAD = 6.0
+_MORE_COARSE = 3
 # Candidates of different searches closer than this are the same.
 _SAME_DEG = 8.0
 _FIRST = Schedule((0, 0, 0, 0), (1, 1, 1, 1), (6, 4, 3, 2))
@@ -116,19 +120,27 @@ class TemplateHypotheses:
         if prior is not None and prior.healthy:
             starts.append(Start(self._fitter.centred(prior.T_cam_target, frame.camera, field, scorer.luma)))
             n_coarse = max(1, n_coarse // _TRACKED_DIVISOR)
-        aligned = self._align(starts + self._coarse(whole_placement(mask), frame, field, n_coarse), frame, scorer)
+        placements = whole_placement(mask)
+        aligned = self._align(starts + self._coarse(placements, frame, field, n_coarse), frame, scorer)
         best = max(aligned, key=lambda a: a.score, default=None)
         if best is None or (best.score < _POOR_SCORE and not self._confirms(best.T_cam_target, prior)):
             # The mask is not the whole silhouette: look for those that it may be a part of.
             cut = detection.touches_border()
             placements = cut_placements(mask) if cut else partial_placements(mask)
-            aligned += self._align(self._coarse(placements, frame, field, self._options.n_coarse), frame, scorer)
-        scored = self._finish(self._select(aligned), frame, scorer)
+            n_coarse = self._options.n_coarse
+            aligned += self._align(self._coarse(placements, frame, field, n_coarse), frame, scorer)
+        selected = self._select(aligned, self._max_candidates)
+        scored = self._finish(selected, frame, scorer)
         leader = max(scored, key=lambda pair: pair[1], default=None)
         if scorer.dark_around and (leader is None or not self._confirms(leader[0], prior)):
             # What lies in shadow is missing from the mask: compare what is bright.
             lit = self._align(self._coarse_lit(frame, scorer), frame, scorer)
             scored += self._finish(lit, frame, scorer)
+        if not self._is_clear(scored, prior):
+            further = self._coarse(placements, frame, field, _MORE_COARSE * self._options.n_coarse)[n_coarse:]
+            aligned += self._align(further, frame, scorer)
+            more = self._select(aligned, 2 * self._max_candidates)
+            scored += self._finish([start for start in more if start not in selected], frame, scorer)
         if not scored:
             return Candidates.none()
         scored.sort(key=lambda pair: -pair[1])
@@ -198,13 +210,13 @@ class TemplateHypotheses:
             out.append(Aligned(fit.T_cam_target, start.to_sun_cam, score))
         return out
 
-    def _select(self, aligned: list[Aligned]) -> list[Aligned]:
-        """The K of best shape that are distinct basins, best first."""
+    def _select(self, aligned: list[Aligned], n_best: int) -> list[Aligned]:
+        """Those of best shape that are distinct basins, best first."""
         if not aligned:
             return []
         ordered = sorted(aligned, key=lambda a: -a.score)
         R = np.stack([a.T_cam_target[:3, :3] for a in ordered])
-        return [ordered[i] for i in distinct(R, self._max_candidates, np.radians(self._options.separation_deg))]
+        return [ordered[i] for i in distinct(R, n_best, np.radians(self._options.separation_deg))]
 
     def _confirms(self, T_cam_target: NDArray[np.float64], prior: PosePrior | None) -> bool:
         """Whether a candidate that leads is the healthy prior's: then nothing else is looked for."""
@@ -212,6 +224,15 @@ class TemplateHypotheses:
             return False
         apart_rad = lie.angle_between(T_cam_target[:3, :3], prior.T_cam_target[:3, :3])
         return bool(apart_rad < np.radians(self._options.separation_deg))
+
+    def _is_clear(self, scored: list[tuple[NDArray[np.float64], float]], prior: PosePrior | None) -> bool:
+        """Whether a candidate leads all other basins by far, or leads where the track expects it."""
+        if not scored:
+            return False
+        leader, best = max(scored, key=lambda pair: pair[1])
+        apart_rad = lie.angle_between(np.stack([T[:3, :3] for T, _ in scored]), leader[:3, :3])
+        rivals = np.array([score for _, score in scored])[apart_rad > np.radians(self._options.separation_deg)]
+        return bool(best - rivals.max(initial=-np.inf) >= _CLEAR_LEAD) or self._confirms(leader, prior)
 
     def _finish(self, starts: list[Aligned], frame: Frame, scorer: Scorer) -> list[tuple[NDArray[np.float64], float]]:
         """Refine on mask and image, and score: poses and log-likelihoods.

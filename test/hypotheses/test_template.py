@@ -6,6 +6,8 @@ from shape_scene import CAMERA, picture, pose_errors, random_pose, spacecraft, s
 from hat_ros import lie
 from hat_ros.config import HatConfig, HypothesesConfig, TemplateConfig
 from hat_ros.errors import ConfigError
+from hat_ros.hypotheses import template
+from hat_ros.hypotheses.matching import match_shape
 from hat_ros.hypotheses.stage import HypothesisStage
 from hat_ros.hypotheses.template import TemplateHypotheses
 from hat_ros.types import Camera, Detection, Frame, PosePrior
@@ -64,6 +66,23 @@ def test_candidates_are_distinct_basins(backend, target):
     angles = np.degrees(lie.angle_between(R[:, None], R[None]))[np.triu_indices(len(R), 1)]
     assert len(R) > 3
     assert np.median(angles) > 15
+
+
+def test_the_search_goes_on_only_where_no_candidate_leads_clearly(backend, target, monkeypatch):
+    counts = []
+
+    def spy(*args):
+        counts.append(args[4])
+        return match_shape(*args)
+
+    monkeypatch.setattr(template, "match_shape", spy)
+    frame, mask = picture(target, random_pose(np.random.default_rng(3), target), background=120)
+    scores = backend.generate(frame, Detection(mask), None).log_score
+    assert scores[0] - scores[1] >= template._CLEAR_LEAD
+    assert len(counts) == 1
+    disc = cv2.circle(np.zeros(mask.shape, np.uint8), (CAMERA.width // 2, CAMERA.height // 2), 40, 1, -1) > 0
+    backend.generate(frame, Detection(disc), None)
+    assert counts[-1] > counts[0]
 
 
 def test_a_mask_two_pixels_too_large_costs_neither_basin_nor_range(backend, target):
