@@ -26,6 +26,11 @@ from hat_ros.types import Candidates, Float, Motion
 _CREDIBLE_SHARE = 1.0 / 3.0
 # A pose measured on one image and a step between two images count the same.
 _DENSE_STEP_WEIGHT = 1.0
+# Residuals beyond this many standard deviations are outliers, and differences below this are none.
+_OUTLIER_SIGMAS = 2.0
+_EXACT = 1e-9
+# From the median size of normally distributed numbers to their standard deviation.
+_MAD_TO_SIGMA = 1.4826
 
 
 @dataclass(frozen=True)
@@ -62,7 +67,8 @@ def solve_offline(candidates: Sequence[Candidates], motions: Sequence[Motion], c
         joint = [frame for frame in anchors if motions[frame].valid and motions[frame].epoch == epoch]
         kept = consistent([anchors[frame] for frame in joint], [motions[frame] for frame in joint], config)
         gate_weight[[frame for frame, keep in zip(joint, kept, strict=True) if not keep]] = 0.0
-        _add_epoch(graph, motions, epoch, {frame: anchors[frame] for frame in joint if gate_weight[frame]}, config)
+        counted = {frame: anchors[frame] for frame in joint if gate_weight[frame]}
+        _add_epoch(graph, motions, epoch, counted, _scale(motions, epoch, counted, config))
     for frame, anchor in anchors.items():
         weight = confidence.update(box_area_px(candidates[frame].box_xyxy))
         if gate_weight[frame]:
@@ -75,26 +81,54 @@ def smooth_measured(T_measured: Float, motions: Sequence[Motion], config: HatCon
     """The joint optimum of poses measured on (nearly) every image and the motion between them.
 
     The error of a measured pose jitters from frame to frame, that of the motion grows slowly; each step counts as much
-    as a measurement, so that a pose is in effect the mean over a few frames on either side.
+    as a measurement, so that a pose is in effect the mean over a few frames on either side. How far steps and
+    measurements usually disagree, in rotation and in position, sets the lever between the two and the scale from which
+    a residual is an outlier.
 
     Args:
         T_measured: (N, 4, 4) ``T_cam_target``, NaN at frames that were not measured.
         motions: per frame.
-        config: loss and lever of the residuals, rules of the alignment.
+        config: rules of the alignment; lever and loss where no step tells them.
 
     Returns:
         (N, 4, 4) poses; NaN at frames that no motion connects to a measured one.
     """
-    fusion = replace(config.fusion, relative_weight=_DENSE_STEP_WEIGHT)
-    graph = PoseGraph(len(motions), fusion, config.alignment.lever_m_per_rad)
     measured = {int(i): T_measured[i] for i in np.flatnonzero(np.isfinite(T_measured).all(axis=(1, 2)))}
+    epochs = {}
     for epoch in sorted({motion.epoch for motion in motions if motion.valid}):
         here = {i: T for i, T in measured.items() if motions[i].valid and motions[i].epoch == epoch}
-        _add_epoch(graph, motions, epoch, here, config)
+        epochs[epoch] = here, _scale(motions, epoch, here, config)
+    differences = [
+        _difference(step, here[i - 1], here[i])
+        for here, scale in epochs.values()
+        for i in here
+        if i - 1 in here and scale and (step := relative_motion(motions[i - 1], motions[i], scale)) is not None
+    ]
+    lever, delta = _residual_scales(differences, config)
+    fusion = replace(config.fusion, relative_weight=_DENSE_STEP_WEIGHT, huber_delta_m=delta, loss="huber")
+    graph = PoseGraph(len(motions), fusion, lever)
+    for epoch, (here, scale) in epochs.items():
+        _add_epoch(graph, motions, epoch, here, scale)
     for frame, T in measured.items():
         graph.add_pose(frame, T)
         graph.add_anchor(frame, T, 1.0)
     return graph.solve()
+
+
+def _residual_scales(differences: list[Float], config: HatConfig) -> tuple[float, float]:
+    """Lever in m/rad that makes turn and shift alike, and the residual in metres from which one is an outlier."""
+    if differences:
+        sigma_rad, sigma_m = _MAD_TO_SIGMA * np.median(np.abs(differences), axis=(0, 2))
+        if sigma_rad > _EXACT and sigma_m > _EXACT:
+            return float(sigma_m / sigma_rad), float(_OUTLIER_SIGMAS * sigma_m)
+    return config.alignment.lever_m_per_rad, config.fusion.huber_delta_m
+
+
+def _difference(step: Float, T_before: Float, T_after: Float) -> Float:
+    """What separates a pose from the step applied to the one before: (2, 3) rotation vector, shift in metres."""
+    predicted = step @ T_before
+    turn = lie.so3_log((predicted[:3, :3] @ T_after[:3, :3].T)[None])[0]
+    return np.stack([turn, predicted[:3, 3] - T_after[:3, 3]])
 
 
 def consistent(anchors: Sequence[Float], motions: Sequence[Motion], config: HatConfig) -> NDArray[np.bool_]:
@@ -174,17 +208,22 @@ def backtrace(candidates: Sequence[Candidates], motions: Sequence[Motion], confi
     return chosen
 
 
-def _add_epoch(
-    graph: PoseGraph, motions: Sequence[Motion], epoch: int, anchors: dict[int, Float], config: HatConfig
-) -> None:
-    """Poses and steps of a SLAM epoch that has enough anchors to tell its scale."""
+def _scale(motions: Sequence[Motion], epoch: int, anchors: dict[int, Float], config: HatConfig) -> float:
+    """Metres per SLAM unit of an epoch by its anchors; 0 where they are too few to tell."""
     alignment = SlamAlignment(config.alignment)
     for frame, anchor in anchors.items():
         alignment.observe(anchor, motions[frame].T_slam_cam)
     alignment.update(epoch)
-    if alignment.current is None:
+    return 0.0 if alignment.current is None else alignment.current.scale
+
+
+def _add_epoch(
+    graph: PoseGraph, motions: Sequence[Motion], epoch: int, anchors: dict[int, Float], scale: float
+) -> None:
+    """Poses and steps of a SLAM epoch whose scale is known."""
+    if not scale:
         return
-    scale, at = alignment.current.scale, np.array(list(anchors))
+    at = np.array(list(anchors))
     for frame, motion in enumerate(motions):
         if not motion.valid or motion.epoch != epoch:
             continue

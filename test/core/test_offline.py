@@ -232,6 +232,18 @@ class TestSmoothMeasured:
         smooth = smooth_measured(scene.T_cam_target, motions, self.CONFIG)
         assert rotation_error_deg(smooth, scene.T_cam_target).max() < 0.3
 
+    def test_a_step_that_is_far_off_moves_nothing(self):
+        scene = make_scene(60, rate_deg=3, gauge=np.eye(4))
+        motions = _recorded(scene)[1]
+        for i in range(30, 60):
+            jump = lie.transform(lie.so3_exp(np.radians([0.0, 4.0, 0.0])), np.array([0.3, 0.0, 0.0]))
+            motions[i] = Motion(True, 0, lie.row_from_matrix(jump @ motions[i].T_slam_cam))
+        measured = self._noisy(scene, sigma_deg=0.2, sigma_m=0.01)
+        smooth = smooth_measured(measured, motions, self.CONFIG)
+        assert rotation_error_deg(smooth, scene.T_cam_target)[25:35].max() < 0.8
+        shift_m = np.linalg.norm(smooth[:, :3, 3] - scene.T_cam_target[:, :3, 3], axis=1)
+        assert shift_m[25:35].max() < 0.08
+
     def test_motion_bridges_frames_that_were_not_measured(self):
         scene = make_scene(90, rate_deg=3)
         measured = scene.T_cam_target.copy()
