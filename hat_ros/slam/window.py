@@ -186,7 +186,9 @@ class Window:
     def adjust(self) -> None:
         """Bundle-adjust the window; while it is young, from a wide loss to a narrow one."""
         state, problem = (self.R, self.t, self.X), self._problem(self.trusts_prior)
-        self.cost, self.covariance = self._descend(state, problem, self._config.iterations)
+        # A trusted surface has settled the structure: the last step would find little to do.
+        n_iterations = max(1, self._config.iterations - self.trusts_prior)
+        self.cost, self.covariance = self._descend(state, problem, n_iterations)
 
     def challenge_structure(self, since_ns: int = -1, turn: Float | None = None) -> None:
         """Let the depth-reversed solution take over if it explains the tracks better, or as well and the turn better.
