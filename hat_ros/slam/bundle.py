@@ -10,10 +10,8 @@ coordinates (x/z, y/z). The cost is the sum of
 * squared changes of the angular and linear rate between consecutive frames of the window (constant-rate prior),
 * a weak square that holds the oldest frame and so fixes the gauge.
 
-Poses are updated from the left, ``R <- Exp(d) R`` and ``t <- t + tau``: the origin of the SLAM frame lies in the
-target, so turning and moving stay decoupled. Levenberg-Marquardt on iteratively reweighted normal equations, points
-eliminated first (Triggs et al., "Bundle adjustment - a modern synthesis", 2000, section 6.1). Plain compiled loops, no
-BLAS: the same bytes in every process.
+Levenberg-Marquardt on iteratively reweighted normal equations, points eliminated first (Triggs et al., "Bundle
+adjustment - a modern synthesis", 2000, section 6.1). Plain compiled loops, no BLAS: the same bytes in every process.
 """
 
 from __future__ import annotations
@@ -24,11 +22,21 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hat_ros.slam.linear import (
+    cholesky_in_place,
+    cholesky_solve,
+    factor_system,
+    inverse_of_square,
+    product,
+    rotation,
+    solve_system,
+    turn_between,
+)
+from hat_ros.slam.reprojection import MIN_DEPTH, loss, observe, weight
+
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-# Nearer than this share of the unit (the target's distance at the start) a point counts as behind the camera.
-_MIN_DEPTH = 1e-3
 # Squared scales, in sigmas, of the losses on expected points and rotations; rotations all share their gauge, so that a
 # drift across the window may set the outer ones far apart.
 _POINT_CUTOFF_SQ = 9.0
@@ -67,218 +75,6 @@ class Problem(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def rotation(v: Float) -> Float:
-    """Rotation matrix (3, 3) of a rotation vector (3,) in radians."""
-    s = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
-    if s < 1e-12:
-        a, b = 1.0 - s / 6.0, 0.5 - s / 24.0
-    else:
-        angle = np.sqrt(s)
-        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / s
-    x, y, z = v[0], v[1], v[2]
-    R = np.empty((3, 3))
-    R[0, 0], R[0, 1], R[0, 2] = 1 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
-    R[1, 0], R[1, 1], R[1, 2] = b * x * y + a * z, 1 - b * (x * x + z * z), b * y * z - a * x
-    R[2, 0], R[2, 1], R[2, 2] = b * x * z - a * y, b * y * z + a * x, 1 - b * (x * x + y * y)
-    return R
-
-
-@njit(cache=True, nogil=True)
-def product(A: Float, B: Float) -> Float:
-    """Matrix product of two (3, 3)."""
-    C = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            C[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
-    return C
-
-
-@njit(cache=True, nogil=True)
-def turn_between(R_b: Float, R_a: Float) -> Float:
-    """Rotation vector (3,) of ``R_b R_a^T``, for angles below 180 degrees."""
-    D = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            D[i, j] = R_b[i, 0] * R_a[j, 0] + R_b[i, 1] * R_a[j, 1] + R_b[i, 2] * R_a[j, 2]
-    v = np.empty(3)
-    v[0], v[1], v[2] = 0.5 * (D[2, 1] - D[1, 2]), 0.5 * (D[0, 2] - D[2, 0]), 0.5 * (D[1, 0] - D[0, 1])
-    sine = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-    if sine > 1e-9:
-        v *= np.arctan2(sine, 0.5 * (D[0, 0] + D[1, 1] + D[2, 2] - 1.0)) / sine
-    return v
-
-
-@njit(cache=True, nogil=True)
-def cholesky_in_place(A: Float) -> bool:
-    """Lower factor of a symmetric matrix, read from and written to its lower triangle; False if not definite."""
-    for j in range(A.shape[0]):
-        for i in range(j, A.shape[0]):
-            s = A[i, j]
-            for k in range(j):
-                s -= A[i, k] * A[j, k]
-            if i > j:
-                A[i, j] = s / A[j, j]
-            elif s > 0.0:
-                A[j, j] = np.sqrt(s)
-            else:
-                return False
-    return True
-
-
-@njit(cache=True, nogil=True)
-def cholesky_solve(L: Float, b: Float) -> Float:
-    """Solution of ``L L^T x = b``."""
-    n = L.shape[0]
-    x = b.copy()
-    for i in range(n):
-        for k in range(i):
-            x[i] -= L[i, k] * x[k]
-        x[i] /= L[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            x[i] -= L[k, i] * x[k]
-        x[i] /= L[i, i]
-    return x
-
-
-@njit(cache=True, nogil=True)
-def _factor_system(S: Float) -> bool:
-    """Factor U of a symmetric matrix, S = U^T U, read from and written to the upper triangle; False if not definite.
-
-    Row by row, so that the inner loop runs along memory and has no sum to carry: the compiler can use vectors.
-    """
-    n = S.shape[0]
-    for j in range(n):
-        if not S[j, j] > 0.0:
-            return False
-        S[j, j] = np.sqrt(S[j, j])
-        pivot_row = S[j, j + 1 :]
-        inverse = 1.0 / S[j, j]
-        for k in range(len(pivot_row)):
-            pivot_row[k] *= inverse
-        for i in range(len(pivot_row)):
-            f = pivot_row[i]
-            source, row = pivot_row[i:], S[j + 1 + i, j + 1 + i :]
-            for k in range(len(row)):
-                row[k] -= f * source[k]
-    return True
-
-
-@njit(cache=True, nogil=True)
-def _solve_system(U: Float, b: Float) -> Float:
-    """Solution of ``U^T U x = b``."""
-    n = U.shape[0]
-    x = b.copy()
-    for i in range(n):
-        x[i] /= U[i, i]
-        f = x[i]
-        rest, row = x[i + 1 :], U[i, i + 1 :]
-        for k in range(len(row)):
-            rest[k] -= f * row[k]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            x[i] -= U[i, k] * x[k]
-        x[i] /= U[i, i]
-    return x
-
-
-@njit(cache=True, nogil=True)
-def _inverse_of_square(U: Float) -> Float:
-    """Inverse of ``U^T U``."""
-    n = U.shape[0]
-    inverse = np.empty((n, n))
-    for a in range(n):
-        unit = np.zeros(n)
-        unit[a] = 1.0
-        inverse[a] = _solve_system(U, unit)
-    return inverse
-
-
-@njit(cache=True, nogil=True)
-def _observe(R: Float, t: Float, X: Float, xn: Float, focal: float, r: Float, J_pose: Float, J_point: Float) -> bool:
-    """Residual (2,) px and its Jacobians (2, 6), (2, 3); False when the point is behind the camera."""
-    rx = R[0, 0] * X[0] + R[0, 1] * X[1] + R[0, 2] * X[2]
-    ry = R[1, 0] * X[0] + R[1, 1] * X[1] + R[1, 2] * X[2]
-    rz = R[2, 0] * X[0] + R[2, 1] * X[1] + R[2, 2] * X[2]
-    z = rz + t[2]
-    if z < _MIN_DEPTH:
-        return False
-    u, v, f = (rx + t[0]) / z, (ry + t[1]) / z, focal / z
-    r[0], r[1] = focal * (u - xn[0]), focal * (v - xn[1])
-    # d(u, v)/d(p_cam) = f [1 0 -u; 0 1 -v]; d(p_cam)/d(rotation) = -[R X]x.
-    J_pose[0, 0], J_pose[0, 1], J_pose[0, 2] = -f * u * ry, f * (rz + u * rx), -f * ry
-    J_pose[1, 0], J_pose[1, 1], J_pose[1, 2] = -f * (rz + v * ry), f * v * rx, f * rx
-    J_pose[0, 3], J_pose[0, 4], J_pose[0, 5] = f, 0.0, -f * u
-    J_pose[1, 3], J_pose[1, 4], J_pose[1, 5] = 0.0, f, -f * v
-    for j in range(3):
-        J_point[0, j] = f * (R[0, j] - u * R[2, j])
-        J_point[1, j] = f * (R[1, j] - v * R[2, j])
-    return True
-
-
-@njit(cache=True, nogil=True)
-def _loss(error_sq: float, cutoff_sq: float) -> float:
-    """Geman-McClure: the square near zero, ``cutoff_sq`` far away."""
-    return cutoff_sq * error_sq / (cutoff_sq + error_sq)
-
-
-@njit(cache=True, nogil=True)
-def _weight(error_sq: float, cutoff_sq: float) -> float:
-    """Weight of the square that has the same gradient as :func:`_loss`."""
-    q = cutoff_sq / (cutoff_sq + error_sq)
-    return q * q
-
-
-@njit(cache=True, nogil=True)
-def refine_pose(
-    R: Float, t: Float, X: Float, xn: Float, use: Bool, focal: float, sigma_px: float, cutoff_px: float,
-    R_expected: Float, t_expected: Float, turn_info: float, move_info: float, n_iterations: int,
-) -> tuple[Float, Float, Float]:  # fmt: skip
-    """Pose of one frame from known points, pulled towards an expected pose; Gauss-Newton.
-
-    Args:
-        R, t: (3, 3), (3,) start.
-        X: (N, 3) points; xn: (N, 2) normalised observations; use: (N,) which of them count.
-        focal, sigma_px, cutoff_px: as in :class:`Problem`.
-        R_expected, t_expected: expected pose; turn_info (1/rad^2), move_info (1/unit^2) its information.
-        n_iterations: steps.
-
-    Returns:
-        R (3, 3), t (3,), and the residual norms (N,) in pixels, infinite where there is none.
-    """
-    R, t = R.copy(), t.copy()
-    residual = np.full(len(X), np.inf)
-    H, b = np.empty((6, 6)), np.empty(6)
-    r, J, J_point = np.empty(2), np.empty((2, 6)), np.empty((2, 3))
-    for iteration in range(n_iterations + 1):
-        H[:], b[:], residual[:] = 0.0, 0.0, np.inf
-        for i in range(len(X)):
-            if not use[i] or not _observe(R, t, X[i], xn[i], focal, r, J, J_point):
-                continue
-            error_sq = r[0] * r[0] + r[1] * r[1]
-            residual[i] = np.sqrt(error_sq)
-            w = _weight(error_sq, cutoff_px * cutoff_px) / (sigma_px * sigma_px)
-            for a in range(6):
-                b[a] -= w * (J[0, a] * r[0] + J[1, a] * r[1])
-                for c in range(a + 1):
-                    H[a, c] += w * (J[0, a] * J[0, c] + J[1, a] * J[1, c])
-        if iteration == n_iterations:
-            break
-        turn = turn_between(R, R_expected)
-        for a in range(3):
-            H[a, a] += turn_info
-            H[a + 3, a + 3] += move_info
-            b[a] -= turn_info * turn[a]
-            b[a + 3] -= move_info * (t[a] - t_expected[a])
-        if not cholesky_in_place(H):
-            break
-        d = cholesky_solve(H, b)
-        R = product(rotation(d[:3]), R)
-        t += d[3:]
-    return R, t, residual
-
-
-@njit(cache=True, nogil=True)
 def window_cost(R: Float, t: Float, X: Float, p: Problem) -> float:
     """Value of the cost (module text) at a state (W, 3, 3), (W, 3), (N, 3)."""
     W, N = p.seen.shape
@@ -292,19 +88,19 @@ def window_cost(R: Float, t: Float, X: Float, p: Problem) -> float:
             x = R[k, 0, 0] * X[i, 0] + R[k, 0, 1] * X[i, 1] + R[k, 0, 2] * X[i, 2] + t[k, 0]
             y = R[k, 1, 0] * X[i, 0] + R[k, 1, 1] * X[i, 1] + R[k, 1, 2] * X[i, 2] + t[k, 1]
             z = R[k, 2, 0] * X[i, 0] + R[k, 2, 1] * X[i, 1] + R[k, 2, 2] * X[i, 2] + t[k, 2]
-            if z < _MIN_DEPTH:
+            if z < MIN_DEPTH:
                 cost += cutoff_sq
                 continue
             u, v = scale * (x / z - p.xn[k, i, 0]), scale * (y / z - p.xn[k, i, 1])
-            cost += _loss(u * u + v * v, cutoff_sq)
+            cost += loss(u * u + v * v, cutoff_sq)
     for i in range(N):
         if p.X_info[i] > 0.0:
             d = X[i] - p.X_expected[i]
-            cost += _loss(p.X_info[i] * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), _POINT_CUTOFF_SQ)
+            cost += loss(p.X_info[i] * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), _POINT_CUTOFF_SQ)
     for k in range(W):
         if p.R_info[k] > 0.0:
             d = turn_between(R[k], p.R_expected[k])
-            cost += _loss(p.R_info[k] * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), _TURN_CUTOFF_SQ)
+            cost += loss(p.R_info[k] * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), _TURN_CUTOFF_SQ)
     for k in range(1, W - 1):
         before, after = turn_between(R[k], R[k - 1]), turn_between(R[k + 1], R[k])
         for a in range(3):
@@ -354,7 +150,7 @@ def _add_pose_terms(S: Float, g: Float, R: Float, t: Float, p: Problem) -> None:
         if p.R_info[k] > 0.0:
             d = turn_between(R[k], p.R_expected[k])
             w = p.R_info[k]
-            w *= _weight(w * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), _TURN_CUTOFF_SQ)
+            w *= weight(w * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), _TURN_CUTOFF_SQ)
             for a in range(3):
                 S[6 * k + a, 6 * k + a] += w
                 g[6 * k + a] -= w * d[a]
@@ -378,10 +174,10 @@ def _add_observations(
     V[:], b[:], C[:] = 0.0, 0.0, 0.0
     any_seen = False
     for k in range(len(R)):
-        if not p.seen[k, i] or not _observe(R[k], t[k], X[i], p.xn[k, i], p.focal, r, J, J_point):
+        if not p.seen[k, i] or not observe(R[k], t[k], X[i], p.xn[k, i], p.focal, r, J, J_point):
             continue
         any_seen = True
-        w = _weight(r[0] * r[0] + r[1] * r[1], p.cutoff_px * p.cutoff_px) / (p.sigma_px * p.sigma_px)
+        w = weight(r[0] * r[0] + r[1] * r[1], p.cutoff_px * p.cutoff_px) / (p.sigma_px * p.sigma_px)
         o = 6 * k
         for a in range(6):
             w0, w1 = w * J[0, a], w * J[1, a]
@@ -398,7 +194,7 @@ def _add_observations(
     if p.X_info[i] > 0.0:
         d = X[i] - p.X_expected[i]
         w = p.X_info[i]
-        w *= _weight(w * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), _POINT_CUTOFF_SQ)
+        w *= weight(w * (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), _POINT_CUTOFF_SQ)
         for a in range(3):
             V[a, a] += w
             b[a] -= w * d[a]
@@ -488,10 +284,10 @@ def adjust_window(R: Float, t: Float, X: Float, p: Problem, n_iterations: int) -
         _add_pose_terms(S, g, R, t, p)
         for a in range(n):
             S[a, a] += damping * S[a, a] + 1e-9
-        if not _factor_system(S):
+        if not factor_system(S):
             damping *= 100.0
             continue
-        step = _solve_system(S, g)
+        step = solve_system(S, g)
         for k in range(W):
             R_new[k] = product(rotation(step[6 * k : 6 * k + 3]), R[k])
             t_new[k] = t[k] + step[6 * k + 3 : 6 * k + 6]
@@ -502,7 +298,7 @@ def adjust_window(R: Float, t: Float, X: Float, p: Problem, n_iterations: int) -
             continue
         R[:], t[:], X[:] = R_new, t_new, X_new
         # The last block of the inverse needs only the last block of the factor.
-        covariance = _inverse_of_square(S[n - 12 :, n - 12 :])
+        covariance = inverse_of_square(S[n - 12 :, n - 12 :])
         damping = max(0.2 * damping, 1e-6)
         gain, cost = cost - new_cost, new_cost
         if gain < 1e-4 * cost:

@@ -1,0 +1,137 @@
+"""Rotations and small dense linear algebra, compiled: plain loops and no BLAS, so the same bytes in every process."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+
+@njit(cache=True, nogil=True)
+def rotation(v: Float) -> Float:
+    """Rotation matrix (3, 3) of a rotation vector (3,) in radians."""
+    s = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    if s < 1e-12:
+        a, b = 1.0 - s / 6.0, 0.5 - s / 24.0
+    else:
+        angle = np.sqrt(s)
+        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / s
+    x, y, z = v[0], v[1], v[2]
+    R = np.empty((3, 3))
+    R[0, 0], R[0, 1], R[0, 2] = 1 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
+    R[1, 0], R[1, 1], R[1, 2] = b * x * y + a * z, 1 - b * (x * x + z * z), b * y * z - a * x
+    R[2, 0], R[2, 1], R[2, 2] = b * x * z - a * y, b * y * z + a * x, 1 - b * (x * x + y * y)
+    return R
+
+
+@njit(cache=True, nogil=True)
+def product(A: Float, B: Float) -> Float:
+    """Matrix product of two (3, 3)."""
+    C = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            C[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+    return C
+
+
+@njit(cache=True, nogil=True)
+def turn_between(R_b: Float, R_a: Float) -> Float:
+    """Rotation vector (3,) of ``R_b R_a^T``, for angles below 180 degrees."""
+    D = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            D[i, j] = R_b[i, 0] * R_a[j, 0] + R_b[i, 1] * R_a[j, 1] + R_b[i, 2] * R_a[j, 2]
+    v = np.empty(3)
+    v[0], v[1], v[2] = 0.5 * (D[2, 1] - D[1, 2]), 0.5 * (D[0, 2] - D[2, 0]), 0.5 * (D[1, 0] - D[0, 1])
+    sine = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    if sine > 1e-9:
+        v *= np.arctan2(sine, 0.5 * (D[0, 0] + D[1, 1] + D[2, 2] - 1.0)) / sine
+    return v
+
+
+@njit(cache=True, nogil=True)
+def cholesky_in_place(A: Float) -> bool:
+    """Lower factor of a symmetric matrix, read from and written to its lower triangle; False if not definite."""
+    for j in range(A.shape[0]):
+        for i in range(j, A.shape[0]):
+            s = A[i, j]
+            for k in range(j):
+                s -= A[i, k] * A[j, k]
+            if i > j:
+                A[i, j] = s / A[j, j]
+            elif s > 0.0:
+                A[j, j] = np.sqrt(s)
+            else:
+                return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def cholesky_solve(L: Float, b: Float) -> Float:
+    """Solution of ``L L^T x = b``."""
+    n = L.shape[0]
+    x = b.copy()
+    for i in range(n):
+        for k in range(i):
+            x[i] -= L[i, k] * x[k]
+        x[i] /= L[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            x[i] -= L[k, i] * x[k]
+        x[i] /= L[i, i]
+    return x
+
+
+@njit(cache=True, nogil=True)
+def factor_system(S: Float) -> bool:
+    """Factor U of a symmetric matrix, S = U^T U, read from and written to the upper triangle; False if not definite.
+
+    Row by row, so that the inner loop runs along memory and has no sum to carry: the compiler can use vectors.
+    """
+    n = S.shape[0]
+    for j in range(n):
+        if not S[j, j] > 0.0:
+            return False
+        S[j, j] = np.sqrt(S[j, j])
+        pivot_row = S[j, j + 1 :]
+        inverse = 1.0 / S[j, j]
+        for k in range(len(pivot_row)):
+            pivot_row[k] *= inverse
+        for i in range(len(pivot_row)):
+            f = pivot_row[i]
+            source, row = pivot_row[i:], S[j + 1 + i, j + 1 + i :]
+            for k in range(len(row)):
+                row[k] -= f * source[k]
+    return True
+
+
+@njit(cache=True, nogil=True)
+def solve_system(U: Float, b: Float) -> Float:
+    """Solution of ``U^T U x = b``."""
+    n = U.shape[0]
+    x = b.copy()
+    for i in range(n):
+        x[i] /= U[i, i]
+        f = x[i]
+        rest, row = x[i + 1 :], U[i, i + 1 :]
+        for k in range(len(row)):
+            rest[k] -= f * row[k]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            x[i] -= U[i, k] * x[k]
+        x[i] /= U[i, i]
+    return x
+
+
+@njit(cache=True, nogil=True)
+def inverse_of_square(U: Float) -> Float:
+    """Inverse of ``U^T U``."""
+    n = U.shape[0]
+    inverse = np.empty((n, n))
+    for a in range(n):
+        unit = np.zeros(n)
+        unit[a] = 1.0
+        inverse[a] = solve_system(U, unit)
+    return inverse
