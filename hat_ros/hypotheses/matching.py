@@ -22,6 +22,8 @@ from hat_ros.types import Camera
 # detector's reach is missing from the mask; mask where there is no target is rarer.
 MISSING_WEIGHT = 0.5
 
+# So many best scores are sorted, the larger number where the smaller holds too few distinct orientations.
+_SORTED_COUNTS = (1024, 4096)
 # Where the centroid of a cut silhouette may lie, in radii of gyration of what is seen, and its size relative to it.
 _CUT_ASSUMPTIONS = tuple(
     (shift, scale) for shift in (0.0, 0.4, 0.9, 1.5, 2.2) for scale in (1.1, 1.4, 1.8, 2.4) if scale > 0.8 + 0.5 * shift
@@ -134,12 +136,14 @@ def _best_matches(
 ) -> ShapeMatches:
     """The best of all scores (placements, views, angles) that are distinct."""
     flat = score.ravel()
-    n_sorted = min(flat.size, 4096)
-    order = np.argpartition(-flat, n_sorted - 1)[:n_sorted]
-    order = order[np.lexsort((order, -flat[order]))]
-    placement, view, angle = np.unravel_index(order, score.shape)
-    T = _poses(bank, placements, placement, view, angle * (2.0 * np.pi / bank.n_angles), camera, center_m)
-    keep = distinct(T[:, :3, :3], n_best, np.radians(separation_deg))
+    for n_sorted in (min(flat.size, count) for count in _SORTED_COUNTS):
+        order = np.argpartition(-flat, n_sorted - 1)[:n_sorted]
+        order = order[np.lexsort((order, -flat[order]))]
+        placement, view, angle = np.unravel_index(order, score.shape)
+        T = _poses(bank, placements, placement, view, angle * (2.0 * np.pi / bank.n_angles), camera, center_m)
+        keep = distinct(T[:, :3, :3], n_best, np.radians(separation_deg))
+        if len(keep) == n_best:
+            break
     return ShapeMatches(T[keep], view[keep], flat[order][keep].astype(np.float64))
 
 
