@@ -41,11 +41,13 @@ class OfflineResult:
         T_cam_target: (N, 4, 4) poses; NaN only when there is no anchor at all.
         chosen: (N,) index of the anchor among the frame's candidates, -1 where there is none.
         gate_weight: (N,) 1 for an anchor that counted, 0 for one that was left out, NaN where there is none.
+        tied: (N,) motion ties the pose to other frames' anchors; False where an anchor stands alone or a pose is held.
     """
 
     T_cam_target: Float
     chosen: NDArray[np.int64]
     gate_weight: Float
+    tied: NDArray[np.bool_]
 
 
 def solve_offline(candidates: Sequence[Candidates], motions: Sequence[Motion], config: HatConfig) -> OfflineResult:
@@ -59,7 +61,7 @@ def solve_offline(candidates: Sequence[Candidates], motions: Sequence[Motion], c
     chosen = backtrace(candidates, motions, config.selector)
     confidence = AreaConfidence(config.fusion)
     graph = PoseGraph(len(motions), config.fusion, config.alignment.lever_m_per_rad)
-    anchors, gate_weight = {}, np.full(len(motions), np.nan)
+    anchors, gate_weight, tied = {}, np.full(len(motions), np.nan), np.zeros(len(motions), dtype=bool)
     for frame in np.flatnonzero(chosen >= 0):
         anchors[int(frame)] = candidates[frame].T_cam_target[chosen[frame]]
         gate_weight[frame] = 1.0
@@ -68,13 +70,13 @@ def solve_offline(candidates: Sequence[Candidates], motions: Sequence[Motion], c
         kept = consistent([anchors[frame] for frame in joint], [motions[frame] for frame in joint], config)
         gate_weight[[frame for frame, keep in zip(joint, kept, strict=True) if not keep]] = 0.0
         counted = {frame: anchors[frame] for frame in joint if gate_weight[frame]}
-        _add_epoch(graph, motions, epoch, counted, _scale(motions, epoch, counted, config))
+        tied[_add_epoch(graph, motions, epoch, counted, _scale(motions, epoch, counted, config))] = True
     for frame, anchor in anchors.items():
         weight = confidence.update(box_area_px(candidates[frame].box_xyxy))
         if gate_weight[frame]:
             graph.add_pose(frame, anchor)
             graph.add_anchor(frame, anchor, weight)
-    return OfflineResult(_hold(graph.solve()), chosen, gate_weight)
+    return OfflineResult(_hold(graph.solve()), chosen, gate_weight, tied)
 
 
 def smooth_measured(T_measured: Float, motions: Sequence[Motion], config: HatConfig) -> Float:
@@ -219,20 +221,22 @@ def _scale(motions: Sequence[Motion], epoch: int, anchors: dict[int, Float], con
 
 def _add_epoch(
     graph: PoseGraph, motions: Sequence[Motion], epoch: int, anchors: dict[int, Float], scale: float
-) -> None:
-    """Poses and steps of a SLAM epoch whose scale is known."""
+) -> list[int]:
+    """Poses and steps of a SLAM epoch whose scale is known; returns its frames."""
     if not scale:
-        return
-    at = np.array(list(anchors))
+        return []
+    at, frames = np.array(list(anchors)), []
     for frame, motion in enumerate(motions):
         if not motion.valid or motion.epoch != epoch:
             continue
         # The motion drifts: the nearest anchor knows best where the search should start.
         nearest = int(at[np.argmin(np.abs(at - frame))])
         graph.add_pose(frame, relative_motion(motions[nearest], motion, scale) @ anchors[nearest])
+        frames.append(frame)
         step = relative_motion(motions[frame - 1], motion, scale) if frame else None
         if step is not None:
             graph.add_step(frame, step)
+    return frames
 
 
 def _hold(poses: Float) -> Float:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from hat_ros import lie
 from hat_ros.config import HatConfig
@@ -64,6 +65,7 @@ class Offline:
         result = solve_offline([step.candidates for step in steps], motions, self._config)
         T_final, covariances = result.T_cam_target, [_NO_COVARIANCE] * len(steps)
         if self._refiner is not None:
+            T_final = self._best_known(T_final, result.tied)
             measured = [self._measured(index, T) for index, T in enumerate(T_final)]
             covariances = [covariance for _, covariance in measured]
             smooth = smooth_measured(np.stack([T for T, _ in measured]), motions, self._config)
@@ -91,30 +93,41 @@ class Offline:
             return causal
         return self._offline_motions(self._config, self._images)
 
+    def _best_known(self, T_decided: Float, tied: NDArray[np.bool_]) -> Float:
+        """Poses (N, 4, 4): the decided ones, and the causal ones where no motion ties the decided to other frames.
+
+        There hindsight knows no more than the causal method did.
+        """
+        out = T_decided.copy()
+        for index in np.flatnonzero(~tied):
+            causal = self._steps[index].estimate
+            if causal.state.has_pose:
+                out[index] = causal.T_cam_target
+        return out
+
     def _measured(self, index: int, T_decided: Float) -> tuple[Float, Float]:
         """The pose (4, 4) that the image of a frame supports near the decided one, and its covariance; NaN: none.
 
-        What the causal method measured in the decided basin stands: it began closer, at the frame before.
+        What the causal method measured in the decided basin stands, unless the image clearly prefers another pose
+        there: it began closer, at the frame before.
         """
-        nothing = np.full((4, 4), np.nan), _NO_COVARIANCE
-        if not np.isfinite(T_decided).all():
-            return nothing
         causal, config = self._steps[index].estimate, self._config.refinement
         T_causal = causal.T_cam_target if causal.state.has_pose else None
-        was_measured = T_causal is not None and causal.gap_frames == 0
-        if was_measured and _apart_deg(T_causal, T_decided) <= config.same_pose_deg:
-            return T_causal, causal.covariance
-        best = self._refined(index, T_decided)
-        T_known = T_decided if best is None else best.T_cam_target
-        if T_causal is not None:
-            apart_deg = _apart_deg(T_causal, T_known)
+        starts = [T_decided] if np.isfinite(T_decided).all() else []
+        if starts and T_causal is not None and (apart_deg := _apart_deg(T_causal, T_decided)) < _SAME_BASIN_DEG:
+            was_measured = causal.gap_frames == 0
             if was_measured and apart_deg <= config.same_pose_deg:
                 return T_causal, causal.covariance
-            if config.same_pose_deg < apart_deg < _SAME_BASIN_DEG:
-                other = self._refined(index, T_causal)
-                if quality(other) > quality(best) + (config.switch_margin if is_supported(best, config) else 0.0):
-                    best = other
-        return (best.T_cam_target, best.covariance) if is_supported(best, config) else nothing
+            if apart_deg > config.same_pose_deg:
+                starts.insert(0 if was_measured else 1, T_causal)
+        best = None
+        for T_start in starts:
+            refined = self._refined(index, T_start)
+            if quality(refined) > quality(best) + (config.switch_margin if is_supported(best, config) else 0.0):
+                best = refined
+        if is_supported(best, config):
+            return best.T_cam_target, best.covariance
+        return np.full((4, 4), np.nan), _NO_COVARIANCE
 
     def _refined(self, index: int, T_cam_target: Float) -> Refined | None:
         frame, detection = self._images.load(index)

@@ -79,6 +79,8 @@ def test_frames_without_slam_or_anchor_hold_their_neighbour():
     T = solve_offline(candidates, motions, preset()).T_cam_target
     np.testing.assert_array_equal(T[1:4], T[[0, 0, 0]])
     np.testing.assert_array_equal(T[30:32], T[[29, 29]])
+    tied = solve_offline(candidates, motions, preset()).tied
+    assert np.flatnonzero(~tied).tolist() == [1, 2, 3, 30, 31], "held, or an anchor that nothing can be compared with"
     empty = solve_offline([Candidates.none()] * 3, motions[:3], preset())
     assert np.isnan(empty.T_cam_target).all()
 

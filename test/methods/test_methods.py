@@ -142,6 +142,13 @@ def test_hindsight_loses_to_the_causal_pose_nowhere_that_matters(frames, target)
     assert offline_deg.mean() <= causal_deg.mean()
 
 
+def test_offline_leaves_the_causal_pose_where_an_anchor_stands_alone(frames, target, monkeypatch):
+    monkeypatch.setitem(BACKENDS["slam"], "knowing", "scripted_backends:NoSlam")
+    steps, method = run("offline", frames, target, refinement={"enabled": True})
+    causal_deg, offline_deg = errors_deg([step.estimate for step in steps]), errors_deg(method.finish())
+    assert offline_deg.mean() <= causal_deg.mean() + 1e-9
+
+
 def test_offline_takes_the_motion_of_hindsight_where_the_backend_has_one(frames, target, monkeypatch):
     monkeypatch.setitem(OFFLINE_MOTIONS, "knowing", "scripted_backends:knowing_in_hindsight")
     monkeypatch.setitem(BACKENDS["slam"], "knowing", "scripted_backends:ReversedSlam")

@@ -56,6 +56,13 @@ class ReversedSlam(KnowingSlam):
         return Motion(True, 0, lie.row_from_matrix(T_slam_cam))
 
 
+class NoSlam(KnowingSlam):
+    """Never knows anything."""
+
+    def update(self, frame, detection, prior) -> Motion:
+        return Motion.none()
+
+
 seen_in_hindsight: list[tuple[int, int]] = []
 
 
