@@ -184,7 +184,7 @@ class SelectorConfig:
     score_scale: float = option(3.0, "alpha: scale of the appearance score", low=0)
     motion_weight_per_deg: float = option(0.3, "mu: penalty per degree of disagreement with the motion", low=0)
     max_motion_penalty: float = option(0.0, "limit of that penalty: earlier candidates may be wrong; 0: none", low=0)
-    warmup_keyframes: int = option(3, "the decoder's choice counts from this keyframe on; appearance before", low=1)
+    warmup_keyframes: int = option(1, "the decoder's choice counts from this keyframe on; appearance before", low=1)
     running_gate: bool = option(False, "fall back to appearance while the candidates look unreliable")
     gate_neighbourhood_deg: float = option(15.0, "candidates this close to the best one count as its support", low=0)
     gate_min_median_support: float = option(2.0, "running median of the support that the decoder needs", low=0)
