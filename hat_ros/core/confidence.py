@@ -17,7 +17,7 @@ class BasinConfidence:
     """Compares the output with the decoder and with appearance alone.
 
     The decoder weighs all keyframes so far, and one clear mistake carries it for a while; the best appearance of a
-    keyframe owes nothing to earlier ones. An output that both vouch for is right; where they differ, nobody knows.
+    keyframe owes nothing to earlier ones. Where the two differ, nobody knows.
 
     Args:
         config: the ``refinement`` section.
