@@ -40,7 +40,7 @@ _YOUNG_CUTOFFS = (8.0, 4.0, 2.0)
 _RIVAL_SHARE, _RIVAL_MARGIN = 0.9, 20.0
 _RIVAL_ITERATIONS = 8
 # Turn from which its direction is beyond doubt, and how much of it two opinions that agree may differ by.
-_TELLING_TURN_RAD, _AGREEING_SHARE = np.radians(0.8), 0.5
+_TELLING_TURN_RAD, _AGREEING_SHARE = np.radians(0.8), 0.75
 # A prior is dropped when the cost without it is lower by this much per observation and is this share of the cost with
 # it; it comes back when it costs less than this more. Right priors of 3 degrees noise stay at half the gain.
 _DISTRUST_GAIN, _DISTRUST_SHARE = 0.04, 0.7
