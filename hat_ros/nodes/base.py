@@ -10,6 +10,7 @@ import logging
 import os
 import time
 import traceback
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -60,7 +61,7 @@ class _Busy(logging.Handler):
         self._node.report(OK, f"{BUSY}{record.getMessage()}")
 
 
-class HatNode(LifecycleNode):
+class HatNode(LifecycleNode, ABC):
     """A lifecycle node in ``/hat``. Subclasses build themselves in :meth:`configure` and take apart in :meth:`cleanup`.
 
     Attributes:
@@ -101,9 +102,9 @@ class HatNode(LifecycleNode):
 
     # ------------------------------------------------------------ for subclasses
 
+    @abstractmethod
     def configure(self) -> None:
         """Build what the node owns and create its endpoints."""
-        raise NotImplementedError
 
     def cleanup(self) -> None:
         """Drop what :meth:`configure` built; endpoints go by themselves."""

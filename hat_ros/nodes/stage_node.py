@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import time
+from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -95,13 +96,13 @@ class StageNode(HatNode):
         """Topics of which one message per frame is needed."""
         return self.JOINED
 
+    @abstractmethod
     def create_stage(self) -> Any:
         """Build the stage object from the configuration."""
-        raise NotImplementedError
 
+    @abstractmethod
     def step(self, stamp_ns: int, frame_id: str, admitted: wire.Admitted, items: dict[str, Any]) -> None:
         """Process one frame: ``items`` are the messages by topic. Exactly one answer must be published."""
-        raise NotImplementedError
 
     def cleanup(self) -> None:
         """Drop the stage."""
