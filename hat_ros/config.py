@@ -272,7 +272,7 @@ class GraphConfig:
     """The ROS graph."""
 
     credits_replay: int = option(4, "W: frames in flight during replay", low=1, high=16)
-    stage_timeout_s: float = option(120.0, "a stage that does not answer in this time is an error", low=0.1)
+    stage_timeout_s: float = option(30.0, "a stage that does not answer in this time is an error", low=0.1)
     startup_timeout_s: float = option(180.0, "a node that is not ready, nor says why, in this time is an error", low=1)
     debug_stage_delay_ms: float = option(0.0, "for latency studies: random extra time per frame, at most this", low=0)
 

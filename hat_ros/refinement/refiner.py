@@ -97,6 +97,7 @@ class PoseFitter:
         self.viewer = viewer
         self._render_px = render_px
         self._max_points = max_points
+        self._rehearse()
 
     def fit(
         self,
@@ -210,3 +211,16 @@ class PoseFitter:
             self.viewer.target.bounding_radius_m,
         )
         return Fit(lie.transform(R, t), H, contour, lines.lines, mask_bias, view)
+
+    def _rehearse(self) -> None:
+        """Fit the target to a made-up mask, so that everything is compiled before the first frame comes."""
+        side = 2 * _CENTRING_PX
+        camera = Camera(np.array([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1.0]]), side, side)
+        target = self.viewer.target
+        T = lie.transform(np.eye(3), np.array([0, 0, 4 * target.bounding_radius_m]) - target.center_m)
+        image = np.zeros((side, side, 3), np.uint8)
+        mask = np.zeros((side, side), np.bool_)
+        mask[side // 4 : -side // 4, side // 4 : -side // 4] = True
+        field = MaskField(mask)
+        self.fit(T, camera, image, field, WITH_MASK)
+        self.centred(T, camera, field, np.zeros((side, side), np.uint8))

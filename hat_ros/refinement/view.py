@@ -232,7 +232,8 @@ def contour_lines(view: View, T_cam_target: NDArray[np.float64], max_points: int
         inner = np.rint(table[:, [COL_V, COL_U]] - table[:, [COL_NV, COL_NU]]).astype(np.intp)
         table = table[view.lit[inner[:, 0], inner[:, 1]]]
     points = (table[:, :3] - T_cam_target[:3, 3]) @ T_cam_target[:3, :3]
-    lines = table[:, [COL_NU, COL_NV, COL_WEIGHT, COL_INSIDE, COL_OUTSIDE]]
+    # In rows, as the solver's other callers have them: another memory layout would be compiled once more.
+    lines = np.ascontiguousarray(table[:, [COL_NU, COL_NV, COL_WEIGHT, COL_INSIDE, COL_OUTSIDE]])
     lines[:, 2:] /= view.scale
     return ContourLines(points, lines)
 

@@ -14,7 +14,7 @@ from hat_ros import lie
 from hat_ros.config import HatConfig
 from hat_ros.slam.surface import SurfacePrior
 from hat_ros.slam.tracks import PointTracks
-from hat_ros.slam.window import Window
+from hat_ros.slam.window import Window, rehearse
 from hat_ros.target import Target
 from hat_ros.types import Camera, Detection, Frame, Motion, PosePrior
 
@@ -56,6 +56,7 @@ class FeatureSlam:
         self._epoch = 0
         self._camera: Camera | None = None
         self._forget()
+        rehearse(self._config)
 
     def update(self, frame: Frame, detection: Detection | None, prior: PosePrior | None) -> Motion:
         """Advance by one frame.

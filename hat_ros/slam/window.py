@@ -343,3 +343,21 @@ class Window:
             t_gauge=self.t[0].copy(),
             gauge_info=_GAUGE_INFO,
         )
+
+
+def rehearse(config: FeatureSlamConfig) -> None:
+    """Put a made-up window through everything that is compiled.
+
+    The first use compiles for many seconds on a new machine: the set-up of a stage has time for that, a frame has not.
+    """
+    n = min(2 * _MIN_SHARED_POINTS, config.max_points)
+    xn, seen = np.zeros((config.max_points, 2)), np.arange(config.max_points) < n
+    angle = np.arange(n)
+    xn[:n] = 0.05 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    window = Window(config, 0, np.zeros(2), 0.1, 1000.0)
+    window.place(np.arange(n), xn[:n], 1.0 + 0.01 * np.cos(3.0 * angle), 0.1)
+    R, t, _ = window.locate(100_000_000, xn, seen)
+    window.append(100_000_000, R, t, xn, seen)
+    window.adjust()
+    window.challenge_prior()
+    window.emit()
