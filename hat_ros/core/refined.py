@@ -156,22 +156,32 @@ class RefinedFusion:
         self._lead = 0.0
 
     def _predictions(self, stamp_ns: int, motion: Motion) -> list[Float]:
-        """Where the track should be now, best first; empty without a track."""
+        """Where the track should be now, best first; empty without a track.
+
+        How the target turns relative motion knows from its second frame, how far it moves in metres only once it is
+        aligned; until then the constant rate says it.
+        """
         if self._output is None:
             return []
         output, previous = self._output
-        out = []
+        at_rate = self._at_constant_rate(stamp_ns)
         scale = 0.0 if self.alignment.current is None else self.alignment.current.scale
         step = relative_motion(previous, motion, scale)
-        if step is not None:
-            aligned = self.alignment.n_observations >= self._fusion.warmup_observations and scale > 0.0
-            position = (step @ output)[:3, 3] if aligned else output[:3, 3]
-            out.append(lie.transform(step[:3, :3] @ output[:3, :3], position))
-        if len(self._measured) >= 2:
-            stamps, poses = zip(*self._measured, strict=True)
-            row = extrapolate(np.array(stamps, dtype=np.int64), np.stack(poses), stamp_ns)
-            out.append(lie.matrix_from_row(row))
-        return out or [output]
+        if step is None:
+            return [output] if at_rate is None else [at_rate]
+        if self.alignment.n_observations >= self._fusion.warmup_observations and scale > 0.0:
+            position = (step @ output)[:3, 3]
+        else:
+            position = (output if at_rate is None else at_rate)[:3, 3]
+        moved = lie.transform(step[:3, :3] @ output[:3, :3], position)
+        return [moved] if at_rate is None else [moved, at_rate]
+
+    def _at_constant_rate(self, stamp_ns: int) -> Float | None:
+        """The measured outputs continued; None with fewer than two."""
+        if len(self._measured) < 2:
+            return None
+        stamps, poses = zip(*self._measured, strict=True)
+        return lie.matrix_from_row(extrapolate(np.array(stamps, dtype=np.int64), np.stack(poses), stamp_ns))
 
     def _best_refined(
         self,

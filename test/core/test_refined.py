@@ -221,6 +221,23 @@ def test_a_quiet_frame_costs_one_refinement(scene):
     assert refiner.calls == 7
 
 
+def test_before_the_alignment_the_constant_rate_says_how_far_the_target_moves(scene):
+    starts = {}
+
+    class Recording(BasinRefiner):
+        def refine(self, frame, detection, T_cam_target):
+            starts.setdefault(frame.stamp_ns // 10**8 - 1, T_cam_target)
+            return super().refine(frame, detection, T_cam_target)
+
+    stage = FusionStage(preset("default"), Recording(scene))
+    estimates = _run(stage, scene, range(8))
+    assert estimates[-1].alignment is None
+    for i in range(3, 8):
+        missed = np.linalg.norm(starts[i][:3, 3] - scene.T_cam_target[i, :3, 3])
+        moved = np.linalg.norm(np.diff(scene.T_cam_target[i - 1 : i + 1, :3, 3], axis=0))
+        assert missed < 0.3 * moved
+
+
 def test_prefix_and_reset(scene):
     a = _run(_stage(scene), scene, range(60), _noisy)
     stage = _stage(scene)
