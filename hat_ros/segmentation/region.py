@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hat_ros.segmentation.ground import GroundEvidence
 from hat_ros.segmentation.masks import Mask, fill_holes
 
 _COLD_ITERATIONS = 3
@@ -19,6 +20,8 @@ _RING_SHARE = 0.02  # width of the image border taken as background, of the long
 _PIECE_SHARE = 0.03  # pieces smaller than this share of the largest are not the target's
 _MOTION_REACH = 0.6  # of the size of what moved: how far beyond it the target may extend
 _OPEN_BESIDE = 0.25  # of what is known of the target: how far beyond its extent a side opens
+
+_K3 = np.ones((3, 3), np.uint8)
 
 
 @dataclass
@@ -40,10 +43,14 @@ class ColorModels:
 
 @dataclass(frozen=True)
 class ClearCut:
-    """A reduced (h, w) 0/1 mask with the colour step across its outline (see :func:`edge_contrast`)."""
+    """A reduced (h, w) 0/1 mask with the colour step across its outline (see :func:`edge_contrast`).
+
+    ``vouched`` for by the ground behind it, or not.
+    """
 
     mask: Mask
     contrast: float
+    vouched: bool = False
 
 
 def graph_cut(rgb: NDArray[np.uint8], labels: Mask, models: ColorModels, iterations: int) -> Mask | None:
@@ -58,11 +65,18 @@ def graph_cut(rgb: NDArray[np.uint8], labels: Mask, models: ColorModels, iterati
     return labels & 1
 
 
-def cut_from_seeds(rgb: NDArray[np.uint8], seeds: list[Mask], margin_px: float, models: ColorModels) -> Mask | None:
+def cut_from_seeds(
+    rgb: NDArray[np.uint8],
+    seeds: list[Mask],
+    margin_px: float,
+    models: ColorModels,
+    seen: GroundEvidence | None = None,
+) -> Mask | None:
     """Cut where seeds (0/1 masks of the same target) leave doubt.
 
     What all seeds contain, ``margin_px`` from their outlines, is target; what is that far outside all of them is
-    background; the rest is decided by the image, starting from the first seed.
+    background; the rest is decided by the image, starting from the first seed. What is seen to stand before the ground
+    is target as far as it hangs together with the seeds; what is like the ground is no certain target.
     """
     size = 2 * max(1, round(margin_px)) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
@@ -72,8 +86,21 @@ def cut_from_seeds(rgb: NDArray[np.uint8], seeds: list[Mask], margin_px: float, 
     maybe = cv2.dilate(some, kernel)
     labels = np.where(maybe > 0, np.where(seeds[0] > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD), cv2.GC_BGD)
     labels = np.where(sure > 0, cv2.GC_FGD, labels).astype(np.uint8)
+    if seen is not None:
+        every |= _note_ground(labels, seen, maybe)
     cut = graph_cut(rgb, labels, models, 1)
     return None if cut is None else tidy(cut, every)
+
+
+def _note_ground(labels: Mask, seen: GroundEvidence, near: Mask) -> Mask:
+    """Write what is known of the ground into GrabCut labels; the pieces before it that reach ``near``, 0/1."""
+    count, pieces = cv2.connectedComponents(seen.target, connectivity=8)
+    touched = np.bincount(pieces[(near & seen.target) > 0], minlength=count) > 0
+    target = touched[pieces].astype(np.uint8) & seen.target
+    labels[(seen.ground > 0) & (labels == cv2.GC_FGD)] = cv2.GC_PR_FGD
+    labels[target > 0] = cv2.GC_PR_FGD
+    labels[cv2.erode(target, _K3, borderType=cv2.BORDER_REPLICATE) > 0] = cv2.GC_FGD
+    return target
 
 
 def cut_from_nothing(rgb: NDArray[np.uint8], open_side: str | None = None, near: Mask | None = None) -> Mask | None:

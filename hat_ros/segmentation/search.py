@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hat_ros.config import ClassicalConfig
 from hat_ros.segmentation import region
 from hat_ros.segmentation.boundary import refine_outline
+from hat_ros.segmentation.ground import CLEAR, GroundMemory
 from hat_ros.segmentation.masks import Mask, Window, overlap, shrink, touched_sides, touches_border
 from hat_ros.segmentation.motion import MotionDetector, MotionEvidence
 from hat_ros.segmentation.shape import SilhouetteBank
@@ -26,6 +27,9 @@ _FOUND_BONUS = 0.1
 _MOTION_RELIEF = 0.1  # ... a mask that motion could have spoken against needs less, ...
 _COARSE_BENEFIT = 0.15  # ... and one that misses this little gets a closer look; ...
 CUT_SURCHARGE = 0.1  # ... one that the border cuts needs more, since part of a silhouette fits many things.
+_GROUND_RELIEF = 0.25  # what stands before ground known all around needs still less
+_GROUND_SIDE_PX = 160  # longer side of the image searched for it
+_GAP_PX = 5  # between pieces of one target
 # How far an outline may move within a frame, of the target's length: 4 degrees and then some; and in pixels.
 _MARGIN_SHARE = 0.05
 _MARGIN_PX = 2.0
@@ -49,20 +53,27 @@ class Found:
 
 
 class Search:
-    """Remembers how the background moves and finds what is not it."""
+    """Remembers how the background moves and finds what is not it.
+
+    Attributes:
+        ground: what is known of the background.
+    """
 
     def __init__(self, config: ClassicalConfig, bank: SilhouetteBank) -> None:
         self._config = config
         self._bank = bank
+        self.ground = GroundMemory()
         self.reset()
 
     def reset(self) -> None:
         """Forget earlier frames."""
         self._motion = MotionDetector()
+        self.ground.reset()
         self._turn = 0
 
-    def push(self, rgb: NDArray[np.uint8]) -> None:
-        """Show it the newest image, (H, W, 3) uint8; to be called once per frame."""
+    def push(self, rgb: NDArray[np.uint8], mask_before: Mask | None = None) -> None:
+        """Show it the newest image, (H, W, 3) uint8, and the previous one's mask; to be called once per frame."""
+        self.ground.push(rgb, mask_before)
         self._window = Window.whole(rgb, self._config.cold_side_px)
         self._motion.push(self._window.rgb)
 
@@ -95,6 +106,9 @@ class Search:
             rgb: the newest image, as pushed.
             open_sides: sides of the image at which it may be cut off.
         """
+        found = self.before_ground(rgb)
+        if found is not None:
+            return found
         whole = self._window
         motion = self._motion.evidence()
         cuts = [region.cut_from_nothing(whole.rgb)]
@@ -131,6 +145,37 @@ class Search:
                 return None
         contrast = region.edge_contrast(region.color_step(window.rgb), cut)
         return Found(at_full_resolution(rgb, window, cut), best_score, contrast, models)
+
+    def before_ground(self, rgb: NDArray[np.uint8]) -> Found | None:
+        """What stands before the ground, once so much of that is known that it is the whole target."""
+        whole = Window.whole(rgb, _GROUND_SIDE_PX)
+        length_px = self.ground.length_known_px(whole)
+        seen = self.ground.evidence(whole, length_px) if length_px > 0 else None
+        if seen is None:
+            return None
+        kernel = np.ones((_GAP_PX, _GAP_PX), np.uint8)
+        piece = region.tidy(cv2.morphologyEx(seen.target, cv2.MORPH_CLOSE, kernel), None)
+        if piece is None:
+            return None
+        x, y, w, h = cv2.boundingRect(whole.enlarge(piece))
+        if max(w, h) > CLEAR * length_px:
+            return None
+        margin = _MARGIN_PX + _MARGIN_SHARE * max(w, h)
+        window = Window.around(rgb, (x, y, x + w, y + h), 2.5 * margin, self._config.work_side_px)
+        if window is None:
+            return None
+        seen, models = self.ground.evidence(window, length_px), region.ColorModels()
+        if seen is None:
+            return None
+        cut = region.cut_from_seeds(
+            window.rgb, [window.reduce(whole.enlarge(piece))], margin * window.scale, models, seen
+        )
+        if cut is None or not seen.vouches_for(cut):
+            return None
+        if self._bank.overlap(cut.astype(bool)) < self._config.min_shape_overlap - _GROUND_RELIEF:
+            return None
+        contrast = region.edge_contrast(region.color_step(window.rgb), cut)
+        return Found(at_full_resolution(rgb, window, cut), 1.0, contrast, models)
 
     def _plausibility(self, mask: Mask, motion: MotionEvidence | None) -> float:
         """How well a mask at the scale of a search is explained: its overlap with the nearest CAD silhouette, less

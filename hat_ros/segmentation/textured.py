@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from hat_ros.config import ClassicalConfig
 from hat_ros.segmentation import region
+from hat_ros.segmentation.ground import GroundEvidence
 from hat_ros.segmentation.masks import SIDES, Mask, Window, moved, overlap, shift_between, touched_sides
 from hat_ros.segmentation.search import (
     AGREEMENT,
@@ -25,6 +26,7 @@ _MIN_CONTINUITY = 0.6  # overlap of a tracked mask with its seed
 _MIN_CONTRAST_KEPT = 0.4  # share of its usual contrast at which a tracked outline is lost
 _CONTRAST_GAIN = 0.2
 _SAME = 0.95  # overlap of two masks that are the same
+_NEARLY_SAME = 0.9
 _BENEFIT_OF_DOUBT = 0.1  # less plausibility keeps a mask than finds one
 _CLEARLY_BETTER = 0.025  # plausibility by which another explanation must beat a predicted one
 _MAX_RETRY_FRAMES = 8
@@ -48,6 +50,7 @@ class TexturedBackground:
         self._contrast = 0.0  # of the tracked outline, slowly following
         self._since_check = 0
         self._check_every = _CHECK_UNAIDED_FRAMES
+        self._vouched = False  # by the ground behind it, for the tracked mask
         self._found_anew = False  # the previous mask: the one before it tells nothing about its motion
         self._failures = 0
         self._wait = 0
@@ -67,12 +70,14 @@ class TexturedBackground:
             silhouette: prediction, None without one.
             trusted: whether somebody vouches for the prediction.
         """
-        self._search.push(rgb)
+        self._search.push(rgb, masks[1])
         if masks[1] is not None:
             shift_xy = (0, 0) if self._found_anew else shift_between(*masks)
             self._found_anew = False
             tracked, aided = self._track(rgb, masks[1], shift_xy, silhouette, trusted)
             self._since_check += 1
+            if tracked is not None and self._vouched:
+                return self._look_around(rgb, tracked) if self._since_check >= self._check_every else tracked
             if tracked is not None:
                 due = self._since_check >= (self._config.check_interval_frames if aided else self._check_every)
                 due = due or overlap(tracked, moved(masks[1], *shift_xy)) < _STEADY
@@ -118,14 +123,22 @@ class TexturedBackground:
             return None, False
         previous = window.reduce(mask, shift_xy)
         predicted = None if silhouette is None else window.reduce(silhouette)
-        best, aided = self._best_cut(window, previous, predicted, trusted, margin)
+        seen = self._search.ground.evidence(window, max(w, h))
+        best, aided = self._best_cut(window, previous, predicted, trusted, margin, seen)
+        self._vouched = best is not None and best.vouched
         if best is None:
             return None, aided
         self._contrast += _CONTRAST_GAIN * (best.contrast - self._contrast)
         return at_full_resolution(rgb, window, best.mask), aided
 
     def _best_cut(
-        self, window: Window, previous: Mask, predicted: Mask | None, trusted: bool, margin: float
+        self,
+        window: Window,
+        previous: Mask,
+        predicted: Mask | None,
+        trusted: bool,
+        margin: float,
+        seen: GroundEvidence | None,
     ) -> tuple[region.ClearCut | None, bool]:
         """Cut from the reduced previous mask, and from the reduced predicted silhouette besides.
 
@@ -138,12 +151,12 @@ class TexturedBackground:
         """
         alone = [previous]
         if predicted is None:
-            return self._cut(window, alone, margin, self._models), False
+            return self._cut(window, alone, margin, self._models, seen), False
         both, tried = [predicted, previous], self._models.copy()
-        best = self._cut(window, both if trusted else alone, margin, self._models)
-        if trusted and best is not None and overlap(best.mask, previous) >= _STEADY:
-            return best, True
-        other = self._cut(window, alone if trusted else both, margin, tried)
+        best = self._cut(window, both if trusted else alone, margin, self._models, seen)
+        if best is not None and (best.vouched or (trusted and overlap(best.mask, previous) >= _STEADY)):
+            return best, trusted
+        other = self._cut(window, alone if trusted else both, margin, tried, seen)
         if other is not None:
             replaces = best is None or (not self._is_better(best, other) if trusted else self._is_better(other, best))
             if replaces:
@@ -152,16 +165,26 @@ class TexturedBackground:
         return best, trusted
 
     def _cut(
-        self, window: Window, seeds: list[Mask], margin: float, models: region.ColorModels
+        self,
+        window: Window,
+        seeds: list[Mask],
+        margin: float,
+        models: region.ColorModels,
+        seen: GroundEvidence | None,
     ) -> region.ClearCut | None:
         """Cut from reduced seeds, the last of them the previous mask; None when it leads away or loses contrast."""
-        cut = region.cut_from_seeds(window.rgb, seeds, margin * window.scale, models)
+        cut = region.cut_from_seeds(window.rgb, seeds, margin * window.scale, models, seen)
         if cut is None:
             return None
+        contrast = region.edge_contrast(region.color_step(window.rgb), cut)
+        if seen is not None:
+            if seen.vouches_for(cut):
+                return region.ClearCut(cut, contrast, vouched=True)
+            if seen.contradicts(cut):
+                return None
         grown = np.count_nonzero(cut) / max(1, np.count_nonzero(seeds[-1]))
         if not 1 / _MAX_AREA_CHANGE <= grown <= _MAX_AREA_CHANGE or overlap(cut, seeds[0]) < _MIN_CONTINUITY:
             return None
-        contrast = region.edge_contrast(region.color_step(window.rgb), cut)
         if contrast < max(MIN_CONTRAST, _MIN_CONTRAST_KEPT * self._contrast):
             return None
         return region.ClearCut(cut, contrast)
@@ -169,6 +192,16 @@ class TexturedBackground:
     def _is_better(self, other: region.ClearCut, than: region.ClearCut) -> bool:
         gain = self._bank.overlap(other.mask.astype(bool)) - self._bank.overlap(than.mask.astype(bool))
         return other.contrast >= than.contrast and gain >= OPEN_BETTER
+
+    def _look_around(self, rgb: NDArray[np.uint8], tracked: Mask) -> Mask:
+        """A mask that the ground vouches for, unless more of the target stands before the ground beyond it."""
+        self._since_check = 0
+        found = self._search.before_ground(rgb)
+        if found is not None and overlap(found.mask, tracked) < _NEARLY_SAME:
+            self._check_every = _CHECK_UNAIDED_FRAMES
+            return self._adopt(found)
+        self._check_every = min(2 * self._check_every, self._config.check_interval_frames)
+        return tracked
 
     def _cross_check(self, rgb: NDArray[np.uint8], tracked: Mask, aided: bool, silhouette: Mask | None) -> Mask | None:
         """Compare a tracked mask with what a search from nothing finds; keep the more plausible one.

@@ -1,0 +1,225 @@
+"""The ground behind the target, remembered: most of what a target hides now was seen before it got in the way.
+
+The ground shifts through the image as a whole, by a homography from frame to frame, found from point tracks outside
+the target. Earlier frames carried along by it say what each pixel would look like without the target. Where all of
+them disagree with the image stands something else; where the image is what they say, from so far back that the target
+was elsewhere, there is ground. Neither owes anything to the colours of the target, so that a part that turns into view
+is found although nobody has seen its colour.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hat_ros.segmentation.masks import Mask, Window, overlap
+
+_SIDE_PX = 320  # longer side of the frames remembered
+_MAX_POINTS = 80
+_MIN_POINTS = 12
+_POINT_QUALITY = 0.005
+_POINT_SPACING_PX = 10
+_TRACK_PX = 15  # side of the patches tracked
+_MAX_ERROR_PX = 0.7  # of a track that follows the ground
+_MIN_FOLLOWING = 0.5  # share of tracks that must
+_SPACING_PX = 5.0  # shift of the ground between frames remembered, at their scale
+_MAX_FRAMES = 40
+_LAGS = (0.2, 0.5, 1.0, 1.5)  # shifts of the ground behind the frames compared, of the target's length
+_MIN_SHIFT_PX = 6.0  # least shift that tells anything, in the image
+_MAX_SHIFT = 0.6  # of a window: what was beyond is hardly in view any more
+_STEP = 10  # 8-bit colour difference that counts
+_SAME = 4  # and one that does not
+_ENOUGH_KNOWN = 0.5  # share of a mask behind which the ground is known
+_ALL_AROUND = 0.85  # and of a mask and its surroundings, for it to be beyond doubt
+_VOUCHED = 0.85  # overlap with what is unlike the ground
+_CONTRADICTED = 0.5
+CLEAR = 0.9  # from so many lengths back none of the target is where it is now
+
+_K3 = np.ones((3, 3), np.uint8)
+_K5 = np.ones((5, 5), np.uint8)
+
+
+@dataclass(frozen=True)
+class GroundEvidence:
+    """What earlier frames say about a window of the newest.
+
+    Attributes:
+        target: (h, w) uint8 0/1, unlike the ground.
+        ground: (h, w) uint8 0/1, like the ground, from so far back that the target was elsewhere.
+        known: (h, w) uint8 0/1, where the ground has been seen.
+    """
+
+    target: Mask
+    ground: Mask
+    known: Mask
+
+    def vouches_for(self, mask: Mask) -> bool:
+        """Whether a 0/1 mask is what stands before the ground, all around which that is known."""
+        around = cv2.dilate(mask, _K5)
+        known_around = np.count_nonzero(around & self.known) >= _ALL_AROUND * np.count_nonzero(around)
+        return known_around and overlap(mask & self.known, self.target) >= _VOUCHED
+
+    def contradicts(self, mask: Mask) -> bool:
+        """Whether a 0/1 mask is not even roughly what stands before the ground, although enough of that is known."""
+        enough = np.count_nonzero(mask & self.known) >= _ENOUGH_KNOWN * np.count_nonzero(mask)
+        return enough and overlap(mask & self.known, self.target) < _CONTRADICTED
+
+
+@dataclass
+class _Remembered:
+    """A frame at reduced scale, where the target was not (0/1), and the (3, 3) homography to the newest frame."""
+
+    rgb: NDArray[np.uint8]
+    free: Mask
+    H_now_then: NDArray[np.float64]
+
+
+class GroundMemory:
+    """Remembers reduced frames and how the ground has moved since."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget earlier frames."""
+        self._frames: list[_Remembered] = []
+        self._grey: NDArray[np.uint8] | None = None
+        self._scale = (1.0, 1.0)
+
+    def push(self, rgb: NDArray[np.uint8], mask_before: Mask | None) -> None:
+        """Add the newest frame, (H, W, 3) uint8, and say where the target was in the one before, if that is known."""
+        small = Window.whole(rgb, _SIDE_PX).rgb
+        grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+        if self._grey is not None and self._grey.shape == grey.shape:
+            if mask_before is not None:
+                size = (small.shape[1], small.shape[0])
+                covered = cv2.resize(mask_before * 255, size, interpolation=cv2.INTER_AREA) > 0
+                self._frames[-1].free = 1 - cv2.dilate(covered.astype(np.uint8), _K5)
+            H = _ground_shift(self._grey, grey, self._frames[-1].free)
+            self._carry(H)
+        else:
+            self._frames = []
+        self._frames.append(_Remembered(small, np.ones(grey.shape, np.uint8), np.eye(3)))
+        self._grey = grey
+        self._scale = (small.shape[1] / rgb.shape[1], small.shape[0] / rgb.shape[0])
+
+    def _carry(self, H_next_prev: NDArray[np.float64] | None) -> None:
+        """Take the next frame's view; forget what is too close to its neighbour, or all where the ground was lost."""
+        if H_next_prev is None:
+            self._frames = []
+            return
+        for frame in self._frames:
+            frame.H_now_then = H_next_prev @ frame.H_now_then
+        height, width = self._grey.shape
+        middle = (width / 2, height / 2)
+        if len(self._frames) >= 2:
+            apart = _moved(self._frames[-1].H_now_then, middle) - _moved(self._frames[-2].H_now_then, middle)
+            if np.linalg.norm(apart) < _SPACING_PX:
+                del self._frames[-1]
+        del self._frames[:-_MAX_FRAMES]
+
+    def evidence(self, window: Window, length_px: float) -> GroundEvidence | None:
+        """Compare a window of the newest frame with the ground; None while too little of it is known.
+
+        Args:
+            window: of the newest frame as pushed.
+            length_px: of the target, in full-resolution pixels.
+        """
+        to_window = self._to_window(window)
+        compared = self._compared(window, length_px)
+        if not compared:
+            return None
+        changes = [_compare(window.rgb, frame, to_window @ frame.H_now_then) for frame, _ in compared]
+        least, known = _least(changes)
+        ground = np.zeros_like(known)
+        clear = [
+            change for change, (_, shift_px) in zip(changes, compared, strict=True) if shift_px >= CLEAR * length_px
+        ]
+        if clear:
+            # From so far back nothing of the target is compared with itself: this counts where it is known.
+            far_least, far_known = _least(clear)
+            least, known = np.where(far_known > 0, far_least, least), known | far_known
+            ground = ((far_least <= _SAME) & (far_known > 0)).astype(np.uint8)
+        target = cv2.medianBlur(((least > _STEP) & (known > 0)).astype(np.uint8), 3)
+        return GroundEvidence(target, ground & (1 - target), known)
+
+    def length_known_px(self, window: Window) -> float:
+        """Length of the longest target, in full-resolution pixels, that evidence in a window can show completely."""
+        middle, sx = self._middle(window), self._scale[0]
+        shifts = [float(np.linalg.norm(_moved(frame.H_now_then, middle))) / sx for frame in self._frames[:-1]]
+        usable = [shift for shift in shifts if shift <= _MAX_SHIFT * max(window.width, window.height)]
+        return max(usable, default=0.0) / _LAGS[-1]
+
+    def _middle(self, window: Window) -> tuple[float, float]:
+        """A window's middle at the remembered scale."""
+        sx, sy = self._scale
+        return (window.x0 + window.width / 2) * sx, (window.y0 + window.height / 2) * sy
+
+    def _to_window(self, window: Window) -> NDArray[np.float64]:
+        """(3, 3) from the remembered scale to a window's, pixel centres at integers."""
+        (sx, sy), (h, w) = self._scale, window.rgb.shape[:2]
+        u, v = w / window.width, h / window.height
+        return np.array(
+            [
+                [u / sx, 0, (0.5 / sx - window.x0) * u - 0.5],
+                [0, v / sy, (0.5 / sy - window.y0) * v - 0.5],
+                [0, 0, 1.0],
+            ]
+        )
+
+    def _compared(self, window: Window, length_px: float) -> list[tuple[_Remembered, float]]:
+        """The frames worth a comparison with the shift of the ground in the window since, full-resolution pixels."""
+        middle, sx = self._middle(window), self._scale[0]
+        past = self._frames[-2::-1]
+        shifts = [float(np.linalg.norm(_moved(frame.H_now_then, middle))) / sx for frame in past]
+        chosen = []
+        for lag in _LAGS:
+            far = [i for i, shift in enumerate(shifts) if shift >= max(lag * length_px, _MIN_SHIFT_PX)]
+            if far and far[0] not in chosen:
+                chosen.append(far[0])
+        return [(past[i], shifts[i]) for i in chosen]
+
+
+def _ground_shift(before: NDArray[np.uint8], now: NDArray[np.uint8], free: Mask) -> NDArray[np.float64] | None:
+    """(3, 3) homography that most point tracks follow outside the target; None when there is none."""
+    points = cv2.goodFeaturesToTrack(before, _MAX_POINTS, _POINT_QUALITY, _POINT_SPACING_PX, mask=free)
+    if points is None or len(points) < _MIN_POINTS:
+        return None
+    tracked, found, _ = cv2.calcOpticalFlowPyrLK(before, now, points, None, winSize=(_TRACK_PX, _TRACK_PX), maxLevel=2)
+    good = found.ravel() == 1
+    if np.count_nonzero(good) < _MIN_POINTS:
+        return None
+    H, follows = cv2.findHomography(points[good], tracked[good], cv2.RANSAC, _MAX_ERROR_PX)
+    return None if H is None or follows.mean() < _MIN_FOLLOWING else H
+
+
+def _moved(H: NDArray[np.float64], at: tuple[float, float]) -> NDArray[np.float64]:
+    """Where a homography's preimage of a point lies from it, (2,)."""
+    x, y, w = np.linalg.solve(H, [at[0], at[1], 1.0])
+    return np.array([x / w - at[0], y / w - at[1]])
+
+
+def _least(changes: list[tuple[NDArray[np.uint8], Mask]]) -> tuple[NDArray[np.uint8], Mask]:
+    """The least of several changes (h, w), and where enough frames have seen the ground to say so, 0/1.
+
+    Where the target was before differs too, but not in the same place in two frames.
+    """
+    least = np.minimum.reduce([np.where(seen > 0, change, np.uint8(255)) for change, seen in changes])
+    count = np.add.reduce([seen for _, seen in changes])
+    return least, (count >= min(2, len(changes))).astype(np.uint8)
+
+
+def _compare(
+    now: NDArray[np.uint8], then: _Remembered, H: NDArray[np.float64]
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Colour distance (h, w) of each pixel to the range of ground colours around its earlier place, which forgives
+    half a pixel of shift, and where the ground was seen, 0/1."""
+    size = now.shape[1::-1]
+    ground = cv2.warpPerspective(then.rgb, H, size, flags=cv2.INTER_LINEAR)
+    seen = cv2.warpPerspective(then.free, H, size, flags=cv2.INTER_NEAREST)
+    above = cv2.subtract(now, cv2.dilate(ground, _K3))
+    below = cv2.subtract(cv2.erode(ground, _K3), now)
+    return cv2.max(above, below).max(axis=2), cv2.erode(seen, _K3, borderType=cv2.BORDER_CONSTANT, borderValue=0)
