@@ -14,12 +14,15 @@ import numpy as np
 from hat_ros.config import HatConfig
 from hat_ros.render.embree import EmbreeRenderer
 from hat_ros.segmentation.lit import LitBody
-from hat_ros.segmentation.masks import Mask, enlarge
+from hat_ros.segmentation.masks import Mask, enlarge, overlap
 from hat_ros.segmentation.shape import SilhouetteBank
 from hat_ros.segmentation.sky import dark_border_share, lit_regions, measure_sky
 from hat_ros.segmentation.textured import TexturedBackground
 from hat_ros.target import Target
 from hat_ros.types import Detection, Frame, PosePrior
+
+_LEAP = 0.6  # share of that overlap below which a mask is not believed ...
+_MAX_LEAPS = 4  # ... for so many frames
 
 
 class ClassicalSegmenter:
@@ -43,6 +46,8 @@ class ClassicalSegmenter:
         self._textured.reset()
         # Of the frame before the previous one, and of the previous one.
         self._masks: tuple[Mask | None, Mask | None] = (None, None)
+        self._filled = 0.0  # overlap of the last mask with a silhouette beyond doubt
+        self._n_leaps = 0  # masks in a row that were not believed
 
     def update(self, frame: Frame, prior: PosePrior | None) -> Detection | None:
         """Find the target in one frame; None rather than a wrong mask."""
@@ -58,10 +63,24 @@ class ClassicalSegmenter:
             mask = self._lit.find(measured, regions, self._masks[1], silhouette if certain else None)
         if mask is None and (regions or not black):
             mask = self._textured.find(frame.rgb, self._masks, silhouette, supported)
-        if mask is not None and not mask.any():
+        if mask is not None and (not mask.any() or (certain and self._leaps(mask, silhouette))):
             mask = None
         self._masks = (self._masks[1], mask)
         return None if mask is None else Detection(mask.astype(bool))
+
+    def _leaps(self, mask: Mask, silhouette: Mask | None) -> bool:
+        """Whether a mask suddenly leaves a silhouette beyond doubt that the masks so far have filled.
+
+        The ground comes and goes in a frame, a target does not. What lasts is taken for true after a few frames.
+        """
+        if silhouette is None:
+            return False
+        filled = overlap(mask, silhouette)
+        if self._n_leaps < _MAX_LEAPS and filled < _LEAP * self._filled:
+            self._n_leaps += 1
+            return True
+        self._filled, self._n_leaps = filled, 0
+        return False
 
     def _silhouette(self, frame: Frame, prior: PosePrior | None) -> Mask | None:
         """The predicted silhouette (H, W), None without a prior or when it is out of sight."""

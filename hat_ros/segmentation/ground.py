@@ -32,10 +32,9 @@ _MIN_SHIFT_PX = 6.0  # least shift that tells anything, in the image
 _MAX_SHIFT = 0.6  # of a window: what was beyond is hardly in view any more
 _STEP = 10  # 8-bit colour difference that counts
 _SAME = 4  # and one that does not
-_ENOUGH_KNOWN = 0.5  # share of a mask behind which the ground is known
-_ALL_AROUND = 0.85  # and of a mask and its surroundings, for it to be beyond doubt
+_ALL_AROUND = 0.85  # share of a mask and its surroundings where the ground is known, for it to be beyond doubt
 _VOUCHED = 0.85  # overlap with what is unlike the ground
-_CONTRADICTED = 0.5
+_CONTRADICTED = 0.5  # share that is ground
 CLEAR = 0.9  # from so many lengths back none of the target is where it is now
 
 _K3 = np.ones((3, 3), np.uint8)
@@ -63,9 +62,8 @@ class GroundEvidence:
         return known_around and overlap(mask & self.known, self.target) >= _VOUCHED
 
     def contradicts(self, mask: Mask) -> bool:
-        """Whether a 0/1 mask is not even roughly what stands before the ground, although enough of that is known."""
-        enough = np.count_nonzero(mask & self.known) >= _ENOUGH_KNOWN * np.count_nonzero(mask)
-        return enough and overlap(mask & self.known, self.target) < _CONTRADICTED
+        """Whether most of a 0/1 mask is ground."""
+        return np.count_nonzero(mask & self.ground) > _CONTRADICTED * np.count_nonzero(mask)
 
 
 @dataclass
@@ -207,8 +205,11 @@ def _least(changes: list[tuple[NDArray[np.uint8], Mask]]) -> tuple[NDArray[np.ui
 
     Where the target was before differs too, but not in the same place in two frames.
     """
-    least = np.minimum.reduce([np.where(seen > 0, change, np.uint8(255)) for change, seen in changes])
-    count = np.add.reduce([seen for _, seen in changes])
+    least = np.full(changes[0][0].shape, 255, np.uint8)
+    count = np.zeros_like(least)
+    for change, seen in changes:
+        least = cv2.min(least, cv2.max(change, 255 * (1 - seen)))
+        count += seen
     return least, (count >= min(2, len(changes))).astype(np.uint8)
 
 
@@ -222,4 +223,5 @@ def _compare(
     seen = cv2.warpPerspective(then.free, H, size, flags=cv2.INTER_NEAREST)
     above = cv2.subtract(now, cv2.dilate(ground, _K3))
     below = cv2.subtract(cv2.erode(ground, _K3), now)
-    return cv2.max(above, below).max(axis=2), cv2.erode(seen, _K3, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    red, green, blue = cv2.split(cv2.max(above, below))
+    return cv2.max(cv2.max(red, green), blue), cv2.erode(seen, _K3, borderType=cv2.BORDER_CONSTANT, borderValue=0)

@@ -27,6 +27,7 @@ _FOUND_BONUS = 0.1
 _MOTION_RELIEF = 0.1  # ... a mask that motion could have spoken against needs less, ...
 _COARSE_BENEFIT = 0.15  # ... and one that misses this little gets a closer look; ...
 CUT_SURCHARGE = 0.1  # ... one that the border cuts needs more, since part of a silhouette fits many things.
+_UNMOVED_SURCHARGE = 0.16
 _GROUND_RELIEF = 0.25  # what stands before ground known all around needs still less
 _GROUND_SIDE_PX = 160  # longer side of the image searched for it
 _GAP_PX = 5  # between pieces of one target
@@ -146,6 +147,26 @@ class Search:
         contrast = region.edge_contrast(region.color_step(window.rgb), cut)
         return Found(at_full_resolution(rgb, window, cut), best_score, contrast, models)
 
+    def around(self, rgb: NDArray[np.uint8], silhouette: Mask) -> Found | None:
+        """The target where a pose that the image has supported says that it is; None unless it shows there."""
+        x, y, w, h = cv2.boundingRect(silhouette)
+        margin = margin_px(silhouette)
+        window = Window.around(rgb, (x, y, x + w, y + h), 2.5 * margin, self._config.work_side_px)
+        if window is None:
+            return None
+        seed, models = window.reduce(silhouette), region.ColorModels()
+        seen = self.ground.evidence(window, max(w, h))
+        cut = region.cut_from_seeds(window.rgb, [seed], margin * window.scale, models, seen)
+        if cut is None or overlap(cut, seed) < AGREEMENT or (seen is not None and seen.contradicts(cut)):
+            return None
+        step = region.color_step(window.rgb)
+        contrast = region.edge_contrast(step, cut)
+        if contrast < max(MIN_CONTRAST, region.chance_contrast(step, cut)):
+            return None
+        mask = at_full_resolution(rgb, window, cut)
+        plausibility, required = self.judge(mask)
+        return Found(mask, plausibility, contrast, models) if plausibility >= required else None
+
     def before_ground(self, rgb: NDArray[np.uint8]) -> Found | None:
         """What stands before the ground, once so much of that is known that it is the whole target."""
         whole = Window.whole(rgb, _GROUND_SIDE_PX)
@@ -154,7 +175,9 @@ class Search:
         if seen is None:
             return None
         kernel = np.ones((_GAP_PX, _GAP_PX), np.uint8)
-        piece = region.tidy(cv2.morphologyEx(seen.target, cv2.MORPH_CLOSE, kernel), None)
+        joined = cv2.morphologyEx(seen.target, cv2.MORPH_CLOSE, kernel)
+        pieces = [piece for piece in (region.tidy(joined, None), region.tidy(joined, joined)) if piece is not None]
+        piece = max(pieces, key=lambda piece: self._bank.overlap(piece.astype(bool)), default=None)
         if piece is None:
             return None
         x, y, w, h = cv2.boundingRect(whole.enlarge(piece))
@@ -172,10 +195,11 @@ class Search:
         )
         if cut is None or not seen.vouches_for(cut):
             return None
-        if self._bank.overlap(cut.astype(bool)) < self._config.min_shape_overlap - _GROUND_RELIEF:
+        plausibility = self._bank.overlap(cut.astype(bool))
+        if plausibility < self._config.min_shape_overlap - _GROUND_RELIEF:
             return None
         contrast = region.edge_contrast(region.color_step(window.rgb), cut)
-        return Found(at_full_resolution(rgb, window, cut), 1.0, contrast, models)
+        return Found(at_full_resolution(rgb, window, cut), plausibility, contrast, models)
 
     def _plausibility(self, mask: Mask, motion: MotionEvidence | None) -> float:
         """How well a mask at the scale of a search is explained: its overlap with the nearest CAD silhouette, less
@@ -192,7 +216,10 @@ class Search:
         required = self._config.min_shape_overlap
         if motion is not None:
             required -= _MOTION_RELIEF
-        return required + CUT_SURCHARGE if touches_border(mask) else required
+        if not touches_border(mask):
+            return required
+        # So does most of the background, and nothing has spoken against it before it has moved.
+        return required + (CUT_SURCHARGE if motion is not None else _UNMOVED_SURCHARGE)
 
 
 def margin_px(mask: Mask) -> float:

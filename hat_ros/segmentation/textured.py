@@ -82,6 +82,10 @@ class TexturedBackground:
                 due = self._since_check >= (self._config.check_interval_frames if aided else self._check_every)
                 due = due or overlap(tracked, moved(masks[1], *shift_xy)) < _STEADY
                 return self._cross_check(rgb, tracked, aided, silhouette) if due else tracked
+        if trusted and silhouette is not None:
+            found = self._search.around(rgb, silhouette)
+            if found is not None:
+                return self._adopt(found)
         if self._wait > 0:
             self._wait -= 1
             return None

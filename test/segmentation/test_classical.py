@@ -100,6 +100,20 @@ def test_a_wrong_prior_does_not_change_a_mask_before_black_sky(stage, scene):
         assert overlap(stage.update(frame(1 + index, rgb), prior(wrong)).mask, alone) > 0.97
 
 
+def test_a_mask_that_suddenly_leaves_a_sure_silhouette_is_not_believed_at_once(stage, scene):
+    T = scene.pose(0.3, z=9.0)
+    rgb = scene.image(T, noise=1.0)
+    flooded = rgb.copy()
+    flooded[HEIGHT // 2 :, 30:-30] = 200
+    for i in range(3):
+        assert overlap(stage.update(frame(i, rgb), prior(T)).mask, scene.truth(T)) > 0.9
+    assert stage.update(frame(3, flooded), prior(T)) is None
+    assert overlap(stage.update(frame(4, rgb), prior(T)).mask, scene.truth(T)) > 0.9
+    lasting = [stage.update(frame(5 + i, flooded), prior(T)) for i in range(6)]
+    assert lasting[0] is None
+    assert lasting[-1] is not None
+
+
 def planet(scene, T, center, radius):
     """The scene's picture with a bright mottled disc behind it."""
     rgb = scene.image(T)

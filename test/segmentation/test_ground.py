@@ -67,7 +67,7 @@ def test_it_vouches_for_the_right_mask_and_contradicts_another(scene):
     body = window.reduce(truth())
     half = body.copy()
     half[:, : window.rgb.shape[1] // 2] = 0
-    elsewhere = np.roll(body, 40, axis=1)
+    elsewhere = np.roll(body, -40, axis=0)
     assert seen.vouches_for(body)
     assert not seen.contradicts(body)
     assert not seen.vouches_for(half)

@@ -49,3 +49,20 @@ def test_the_outline_at_full_resolution_is_the_found_one(search, scene):
     search.push(rgb)
     found = search.find(rgb, ())
     assert np.count_nonzero(found.mask & truth) / np.count_nonzero(found.mask | truth) > 0.9
+
+
+def test_the_target_is_found_where_a_supported_pose_says_and_nowhere_else(search, scene):
+    for i in range(5):
+        _, rgb, truth = scene.passing(i)
+        search.push(rgb)
+    truth = truth.astype(np.uint8)
+    found = search.around(rgb, truth)
+    assert np.count_nonzero(found.mask & truth) / np.count_nonzero(found.mask | truth) > 0.9
+    assert search.around(rgb, np.roll(truth, 90, axis=1)) is None
+
+
+def test_before_the_ground_has_moved_a_mask_at_the_border_needs_more(search):
+    inside = cv2.circle(np.zeros((HEIGHT, WIDTH), np.uint8), (100, 100), 40, 1, -1)
+    at_border = cv2.circle(np.zeros((HEIGHT, WIDTH), np.uint8), (20, 100), 40, 1, -1)
+    search.push(np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    assert search.judge(at_border)[1] > search.judge(inside)[1] + 0.1
