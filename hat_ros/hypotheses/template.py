@@ -7,8 +7,11 @@
 4. The evidence of each is turned into a log-likelihood (``scoring``): how well its outline and the mask's agree, and
    how well it explains what is bright and what is dark (``refinement.sunlight``).
 
-Unless the best candidate is where the track expects it, more is tried. A mask that no view fits well is matched as
-part of a silhouette. Before a black sky the mask holds what is lit, which need not be the whole target: matches of
+A pose predicted from the past is one more start, however little it is trusted: where the image tells little, a track
+that did not compete would lose to chance.
+
+Unless the best candidate is where a healthy track expects it, more is tried. A mask that no view fits well is matched
+as part of a silhouette. Before a black sky the mask holds what is lit, which need not be the whole target: matches of
 brightness (``lit_bank``) compete as well, and of those only the sunlit part of the contour is compared with the mask.
 Where no candidate leads clearly after that, more shape matches are tried.
 """
@@ -117,9 +120,10 @@ class TemplateHypotheses:
         field = MaskField(mask)
         scorer = Scorer(self._viewer, frame, field, self._options.render_px)
         starts, n_coarse = [], self._options.n_coarse
-        if prior is not None and prior.healthy:
+        if prior is not None:
             starts.append(Start(self._fitter.centred(prior.T_cam_target, frame.camera, field, scorer.luma)))
-            n_coarse = max(1, n_coarse // _TRACKED_DIVISOR)
+            if prior.healthy:
+                n_coarse = max(1, n_coarse // _TRACKED_DIVISOR)
         placements = whole_placement(mask)
         aligned = self._align(starts + self._coarse(placements, frame, field, n_coarse), frame, scorer)
         best = max(aligned, key=lambda a: a.score, default=None)
@@ -134,7 +138,7 @@ class TemplateHypotheses:
         leader = max(scored, key=lambda pair: pair[1], default=None)
         if scorer.dark_around and (leader is None or not self._confirms(leader[0], prior)):
             # What lies in shadow is missing from the mask: compare what is bright.
-            lit = self._align(self._coarse_lit(frame, scorer), frame, scorer)
+            lit = self._align(self._sunlit(starts, frame, scorer) + self._coarse_lit(frame, scorer), frame, scorer)
             scored += self._finish(lit, frame, scorer)
         if not self._is_clear(scored, prior):
             further = self._coarse(placements, frame, field, _MORE_COARSE * self._options.n_coarse)[n_coarse:]
@@ -184,6 +188,11 @@ class TemplateHypotheses:
                 found.append((sunlight.distance, Start(T, sunlight.to_sun_cam)))
         found.sort(key=lambda pair: pair[0])
         return [start for _, start in found[: options.n_refined_lit]]
+
+    def _sunlit(self, starts: list[Start], frame: Frame, scorer: Scorer) -> list[Start]:
+        """The same starts in the sunlight that suits them."""
+        suns = [self._sun.match(start.T_cam_target, frame, scorer.field.mask) for start in starts]
+        return [Start(a.T_cam_target, b.to_sun_cam) for a, b in zip(starts, suns, strict=True) if b is not None]
 
     def _pulled(
         self, bank: ViewBank, matches: ShapeMatches, frame: Frame, field: MaskField

@@ -239,7 +239,7 @@ class Window:
         self._distrust_for(state, cost)
 
     def _distrust_for(self, state: tuple[Float, Float, Float], cost: float) -> None:
-        present = window_cost(self.R, self.t, self.X, self._problem(False))
+        present = self._free_cost(self.R, self.t, self.X)
         if present - cost > _DISTRUST_GAIN * np.count_nonzero(self.seen) and cost < _DISTRUST_SHARE * present:
             self.R, self.t, self.X = state
             self.X_guess = self.X.copy()
@@ -252,10 +252,9 @@ class Window:
         first = int(np.argmin(np.abs(np.array(self.stamps_ns, dtype=np.int64) - self.look_stamp_ns)))
         R, t = self._poses_for(X, known, first)
         self._descend((R, t, X), self._problem(True)._replace(R_info=np.zeros(len(self))), _RIVAL_ITERATIONS)
-        free = self._problem(False)
-        present = window_cost(self.R, self.t, self.X, free)
+        present = self._free_cost(self.R, self.t, self.X)
         allowed = max(present / _TRUST_SHARE, present + _TRUST_LOSS * np.count_nonzero(self.seen))
-        if window_cost(R, t, X, free) < allowed:
+        if self._free_cost(R, t, X) < allowed:
             self.R, self.t, self.X = R, t, X
             self.trusts_prior = True
 
@@ -315,10 +314,16 @@ class Window:
 
     def _descend(self, state: tuple[Float, Float, Float], problem: Problem, n_iterations: int) -> tuple[float, Float]:
         R, t, X = state
+        # Another solution has its own gauge: held at the present one's oldest frame it could not differ.
+        problem = problem._replace(R_gauge=R[0].copy(), t_gauge=t[0].copy())
         if self.number[-1] <= _YOUNG_FRAMES:
             for factor in _YOUNG_CUTOFFS:
                 adjust_window(R, t, X, problem._replace(cutoff_px=factor * problem.cutoff_px), n_iterations)
         return adjust_window(R, t, X, problem, n_iterations)
+
+    def _free_cost(self, R: Float, t: Float, X: Float) -> float:
+        """Cost of a solution in its own gauge, whatever the prior says."""
+        return window_cost(R, t, X, self._problem(False)._replace(R_gauge=R[0], t_gauge=t[0]))
 
     def _problem(self, with_prior: bool) -> Problem:
         seconds = (np.array(self.stamps_ns, dtype=np.int64) - self.stamps_ns[0]) * 1e-9

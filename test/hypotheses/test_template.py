@@ -126,6 +126,19 @@ def test_a_healthy_prior_is_a_candidate(backend, target):
     assert turn.min() < 1
 
 
+def test_a_prior_that_nobody_trusts_competes_in_full_light_and_in_part(backend, target, monkeypatch):
+    T_true = random_pose(np.random.default_rng(2), target)
+    monkeypatch.setattr(backend, "_coarse", lambda *_: [])
+    monkeypatch.setattr(backend, "_coarse_lit", lambda *_: [])
+    row = lie.row_from_matrix(T_true)
+    prior = PosePrior(0, row, row, healthy=False, supported=False)
+    frame, mask = sunlit_picture(target, T_true, (-1.0, 0.4, -0.1))
+    for seen in (mask, mask & (frame.rgb.max(axis=2) > 16)):
+        assert len(backend.generate(frame, Detection(seen), None)) == 0
+        turn, _ = pose_errors(backend.generate(frame, Detection(seen), prior).T_cam_target, T_true)
+        assert turn.min() < 3
+
+
 @pytest.mark.parametrize("level", [0, 255])
 def test_a_blank_image_with_a_box_gives_nothing(backend, level):
     frame = Frame(1, np.full((CAMERA.height, CAMERA.width, 3), level, np.uint8), CAMERA)
