@@ -76,7 +76,8 @@ def cut_from_seeds(
 
     What all seeds contain, ``margin_px`` from their outlines, is target; what is that far outside all of them is
     background; the rest is decided by the image, starting from the first seed. What is seen to stand before the ground
-    is target as far as it hangs together with the seeds; what is like the ground is no certain target.
+    is target as far as it hangs together with the seeds; what is like the ground is none outside the seeds, and not
+    certainly in them.
     """
     size = 2 * max(1, round(margin_px)) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
@@ -87,17 +88,21 @@ def cut_from_seeds(
     labels = np.where(maybe > 0, np.where(seeds[0] > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD), cv2.GC_BGD)
     labels = np.where(sure > 0, cv2.GC_FGD, labels).astype(np.uint8)
     if seen is not None:
-        every |= _note_ground(labels, seen, maybe)
+        every |= _note_ground(labels, seen, some, maybe)
     cut = graph_cut(rgb, labels, models, 1)
     return None if cut is None else tidy(cut, every)
 
 
-def _note_ground(labels: Mask, seen: GroundEvidence, near: Mask) -> Mask:
-    """Write what is known of the ground into GrabCut labels; the pieces before it that reach ``near``, 0/1."""
+def _note_ground(labels: Mask, seen: GroundEvidence, some: Mask, near: Mask) -> Mask:
+    """Write what is known of the ground into GrabCut labels; the pieces before it that reach ``near``, 0/1.
+
+    Like the ground means as dark as the sea as well, so ``some`` seed may know better.
+    """
     count, pieces = cv2.connectedComponents(seen.target, connectivity=8)
     touched = np.bincount(pieces[(near & seen.target) > 0], minlength=count) > 0
     target = touched[pieces].astype(np.uint8) & seen.target
     labels[(seen.ground > 0) & (labels == cv2.GC_FGD)] = cv2.GC_PR_FGD
+    labels[(seen.ground > 0) & (some == 0)] = cv2.GC_BGD
     labels[target > 0] = cv2.GC_PR_FGD
     labels[cv2.erode(target, _K3, borderType=cv2.BORDER_REPLICATE) > 0] = cv2.GC_FGD
     return target

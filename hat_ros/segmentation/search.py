@@ -157,7 +157,11 @@ class Search:
         seed, models = window.reduce(silhouette), region.ColorModels()
         seen = self.ground.evidence(window, max(w, h))
         cut = region.cut_from_seeds(window.rgb, [seed], margin * window.scale, models, seen)
-        if cut is None or overlap(cut, seed) < AGREEMENT or (seen is not None and seen.contradicts(cut)):
+        if (
+            cut is None
+            or overlap(cut, seed) < self._config.min_prior_overlap
+            or (seen is not None and seen.contradicts(cut))
+        ):
             return None
         step = region.color_step(window.rgb)
         contrast = region.edge_contrast(step, cut)
