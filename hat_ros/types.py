@@ -231,6 +231,19 @@ class Motion:
 
 
 @dataclass(frozen=True)
+class RotationPrior:
+    """What is known of a rotation before the image is looked at.
+
+    Attributes:
+        R_cam_target: (3, 3) the expected rotation.
+        information: (3, 3) of the rotation vector r in ``R = exp(r) R_cam_target``, camera axes, 1/rad^2.
+    """
+
+    R_cam_target: Float
+    information: Float
+
+
+@dataclass(frozen=True)
 class Selection:
     """The decoder's answer for one frame (Stage 3).
 

@@ -27,10 +27,11 @@ import numpy as np
 from hat_ros import lie
 from hat_ros.config import HatConfig, RefinementConfig
 from hat_ros.core.alignment import SlamAlignment
+from hat_ros.core.attitude import AttitudeFilter
 from hat_ros.core.causal import Dissent, Fused, fuse_two, relative_motion
 from hat_ros.core.prior import extrapolate
 from hat_ros.core.refiner import Refiner
-from hat_ros.types import Detection, Float, Frame, Motion, Refined
+from hat_ros.types import Detection, Float, Frame, Motion, Refined, RotationPrior
 
 # Measured outputs behind the constant-rate prediction.
 _RATE_HISTORY = 6
@@ -49,6 +50,7 @@ class RefinedFusion:
         self._refiner = refiner
         self.alignment = SlamAlignment(config.alignment)
         self._dissent = Dissent(config.fusion.gate_angle_deg, config.alignment.reset_anchors)
+        self._attitude = AttitudeFilter(np.radians(config.refinement.start_sigma_deg))
         self._lead = 0.0
         self._epoch = 0
         self.lose()
@@ -60,7 +62,9 @@ class RefinedFusion:
         self._measured: deque[tuple[int, Float]] = deque(maxlen=_RATE_HISTORY)
 
     def _start_track(self) -> None:
-        """Nobody has spoken for or against the track yet."""
+        """Nobody has spoken for or against the track yet, and nothing is known of its predictions."""
+        self._attitude.forget()
+        self._held: Refined | None = None
         self._n_agreed = 0
         self._n_disagreed = 0
         self._forget_rivals()
@@ -94,10 +98,11 @@ class RefinedFusion:
         anchor: Float | None,
         confidence: float,
     ) -> Fused:
-        track = self._best_refined(frame, detection, predictions, lead=self._refinement.switch_margin)
         if not predictions:
             return self._start(frame, detection, anchor)
         predicted = predictions[0]
+        self._held = self._refiner.refine(frame, detection, predicted, self._known_of(predicted))
+        track = self._best_refined(frame, detection, predictions[1:], self._held, self._refinement.switch_margin)
         if anchor is None:
             return self._outcome(track, predicted, predicted)
         reference = track.T_cam_target if is_supported(track, self._refinement) else predicted
@@ -107,6 +112,11 @@ class RefinedFusion:
             self._n_disagreed = 0
             return self._agree(frame, detection, track, predicted, anchor, confidence)
         return self._arbitrate(frame, detection, track, predicted, anchor)
+
+    def _known_of(self, predicted: Float) -> RotationPrior:
+        """What the track says of its rotation now."""
+        output, _ = self._output
+        return RotationPrior(predicted[:3, :3], self._attitude.predict(predicted[:3, :3] @ output[:3, :3].T))
 
     def _start(self, frame: Frame, detection: Detection | None, anchor: Float | None) -> Fused:
         """Without a track the anchor starts one; unless the image supports it, it only coasts."""
@@ -213,10 +223,14 @@ class RefinedFusion:
         return bool(apart_rad > np.radians(2.0 * self._refinement.same_pose_deg))
 
     def _outcome(self, refined: Refined | None, otherwise: Float, predicted: Float | None) -> Fused:
-        """A supported refinement as a measurement, or another pose without one."""
+        """A supported refinement as a measurement, which the track learns from, or another pose without one."""
         if not is_supported(refined, self._refinement):
             return Fused(otherwise, predicted)
         T = refined.T_cam_target
+        if refined is self._held:
+            self._attitude.correct(T[:3, :3], predicted[:3, :3], refined.covariance[3:, 3:])
+        else:
+            self._attitude.restart(T[:3, :3], refined.covariance[3:, 3:])
         # An unknown overlap (NaN) is never certain.
         certain = min(refined.overlap, refined.support) >= self._refinement.certain_share or self._n_agreed > 0
         return Fused(

@@ -13,7 +13,7 @@ from hat_ros.refinement.refiner import WITH_MASK, WITHOUT_MASK, Fit, PoseFitter
 from hat_ros.refinement.sunlight import SunMatcher
 from hat_ros.refinement.view import MaskField, Overlap, TargetViewer, View
 from hat_ros.target import Target
-from hat_ros.types import Camera, Detection, Frame, Refined
+from hat_ros.types import Camera, Detection, Frame, Refined, RotationPrior
 
 # The mask's robust scales are meant for a target of this size or more and shrink with smaller ones.
 _USUAL_SIZE_PX = 250.0
@@ -36,18 +36,25 @@ class FusedPoseRefiner:
     def __init__(self, config: RefinementConfig, target: Target) -> None:
         self._config = config
         self._target = target
-        self._start_sigma_rad = np.radians(config.start_sigma_deg)
+        self._start_information = np.radians(config.start_sigma_deg) ** -2 * np.eye(3)
         self._viewer = TargetViewer(target)
         self._sun = SunMatcher(self._viewer)
         self._fitter = PoseFitter(self._viewer, config.render_px, config.max_points)
 
-    def refine(self, frame: Frame, detection: Detection | None, T_cam_target: NDArray[np.float64]) -> Refined | None:
+    def refine(
+        self,
+        frame: Frame,
+        detection: Detection | None,
+        T_cam_target: NDArray[np.float64],
+        prior: RotationPrior | None = None,
+    ) -> Refined | None:
         """Refine a pose within its basin.
 
         Args:
             frame: the current image.
             detection: its mask, None when there is none (the image's edges alone are used then).
             T_cam_target: (4, 4) fused pose.
+            prior: what is known of its rotation; None = ``start_sigma_deg`` about the start.
 
         Returns:
             The refined pose with its uncertainty, or None when the target is out of view, nothing in the image can be
@@ -55,12 +62,13 @@ class FusedPoseRefiner:
         """
         field = MaskField(detection.mask) if detection is not None and detection.silhouette else None
         luma = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        start, fit = self._fit(frame, field, luma, T_cam_target)
+        prior = prior or RotationPrior(T_cam_target[:3, :3], self._start_information)
+        start, fit = self._fit(frame, field, luma, T_cam_target, prior)
         if fit is not None and field is not None and _lies_in_shadow(field.compare(fit.view, luma)):
             # Part of the silhouette cannot be seen: find out which, and fit what can.
             sunlight = self._sun.match(start, frame, field.mask)
             if sunlight is not None:
-                fit = self._fit_all(frame, field, start, sunlight.to_sun_cam) or fit
+                fit = self._fit_all(frame, field, start, prior, sunlight.to_sun_cam) or fit
         if fit is None or not self._same_basin(start, fit.T_cam_target):
             return None
         covariance = pose_covariance(fit, self._target.bounding_radius_m)
@@ -76,24 +84,36 @@ class FusedPoseRefiner:
         return Refined(lie.row_from_matrix(fit.T_cam_target), covariance, overlap, fit.support, visible_overlap)
 
     def _fit(
-        self, frame: Frame, field: MaskField | None, luma: NDArray[np.uint8], start: NDArray[np.float64]
+        self,
+        frame: Frame,
+        field: MaskField | None,
+        luma: NDArray[np.uint8],
+        start: NDArray[np.float64],
+        prior: RotationPrior,
     ) -> tuple[NDArray[np.float64], Fit | None]:
         """The finest round alone where that will do, else all rounds, centred if need be: where from, and the fit."""
         view = self._viewer.view(start, frame.camera, self._config.render_px)
-        fit = self._fine(frame, field, start, view)
+        fit = self._fine(frame, field, start, prior, view)
         if fit is None and field is not None:
             centred = self._fitter.centred(start, frame.camera, field, luma)
             if centred is not start:
                 start, view = centred, self._viewer.view(centred, frame.camera, self._config.render_px)
-                fit = self._fine(frame, field, start, view)
-        return start, fit or self._fit_all(frame, field, start, view=view)
+                fit = self._fine(frame, field, start, prior, view)
+        return start, fit or self._fit_all(frame, field, start, prior, view=view)
 
-    def _fine(self, frame: Frame, field: MaskField | None, start: NDArray[np.float64], view: View | None) -> Fit | None:
+    def _fine(
+        self,
+        frame: Frame,
+        field: MaskField | None,
+        start: NDArray[np.float64],
+        prior: RotationPrior,
+        view: View | None,
+    ) -> Fit | None:
         """The finest round alone; None unless that explains the image and hardly moves the start."""
         if field is None or view is None:
             return None
         rounds = WITH_MASK[-1:]
-        fit = self._fitter.fit(start, frame.camera, frame.rgb, field, rounds, self._start_sigma_rad, view=view)
+        fit = self._fitter.fit(start, frame.camera, frame.rgb, field, rounds, prior, view=view)
         if fit.support < _ENOUGH_SUPPORT:
             return None
         return fit if self._largest_move_px(start, fit.T_cam_target, frame.camera) <= _SMALL_MOVE_PX else None
@@ -103,6 +123,7 @@ class FusedPoseRefiner:
         frame: Frame,
         field: MaskField | None,
         start: NDArray[np.float64],
+        prior: RotationPrior,
         to_sun_cam: NDArray[np.float64] | None = None,
         view: View | None = None,
     ) -> Fit | None:
@@ -111,7 +132,7 @@ class FusedPoseRefiner:
         if field is not None:
             factor = float(np.clip(field.size_px / _USUAL_SIZE_PX, *_SCALE_LIMITS))
             rounds = (WITH_MASK[0].scaled(factor), *WITH_MASK[1:])
-        return self._fitter.fit(start, frame.camera, frame.rgb, field, rounds, self._start_sigma_rad, to_sun_cam, view)
+        return self._fitter.fit(start, frame.camera, frame.rgb, field, rounds, prior, to_sun_cam, view)
 
     def reset(self) -> None:
         """Nothing to forget: every frame stands for itself."""

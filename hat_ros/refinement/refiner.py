@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hat_ros import lie
 from hat_ros.refinement.solver import fit_contour
 from hat_ros.refinement.view import MaskField, TargetViewer, View, contour_lines
-from hat_ros.types import Camera, Frame
+from hat_ros.types import Camera, Frame, RotationPrior
 
 _NO_DISTANCE = np.zeros((2, 2), np.float32)
 _NO_ORIGIN = np.zeros(2)
@@ -106,11 +106,11 @@ class PoseFitter:
         image: NDArray[np.uint8],
         field: MaskField | None,
         rounds: tuple[Schedule, ...],
-        prior_sigma_rad: float = np.inf,
+        prior: RotationPrior | None = None,
         to_sun_cam: NDArray[np.float64] | None = None,
         view: View | None = None,
     ) -> Fit | None:
-        """Refine a pose whose rotation is known to a sigma; None when the target leaves the view on the way.
+        """Refine a pose, held to what is known of its rotation; None when the target leaves the view on the way.
 
         With a direction to the sun the contour is that of the sunlit part. The view of the start spares its rendering.
         """
@@ -120,7 +120,7 @@ class PoseFitter:
             view = view or self.viewer.view(T, camera, self._render_px, to_sun_cam)
             if view is None:
                 return None
-            fit = self.iterate(T, view, camera, image, field, schedule, prior_sigma_rad)
+            fit = self.iterate(T, view, camera, image, field, schedule, prior)
             T, view = fit.T_cam_target, None
         return fit
 
@@ -148,7 +148,8 @@ class PoseFitter:
             scales_px,
             off,
             np.full(len(scales_px), _PULL_DAMPING),
-            np.inf,
+            np.zeros(3),
+            np.zeros((3, 3)),
             self.viewer.target.bounding_radius_m,
         )
         return lie.transform(R, t)
@@ -190,9 +191,13 @@ class PoseFitter:
         image: NDArray[np.uint8],
         field: MaskField | None,
         schedule: Schedule,
-        prior_sigma_rad: float = np.inf,
+        prior: RotationPrior | None = None,
     ) -> Fit:
-        """One round with the contour of a view rendered at the start pose, whose rotation is known to a sigma."""
+        """One round with the contour of a view rendered at the start pose."""
+        turned, information = np.zeros(3), np.zeros((3, 3))
+        if prior is not None:
+            turned = lie.so3_log(T_cam_target[:3, :3] @ prior.R_cam_target.T)
+            information = prior.information
         lines = contour_lines(view, T_cam_target, self._max_points)
         R, t, H, contour, mask_bias, _ = fit_contour(
             lines.points_m,
@@ -207,7 +212,8 @@ class PoseFitter:
             np.array(schedule.mask, dtype=np.float64),
             np.array(schedule.edge, dtype=np.float64),
             np.full(len(schedule.reach), schedule.damping),
-            prior_sigma_rad,
+            turned,
+            information,
             self.viewer.target.bounding_radius_m,
         )
         return Fit(lie.transform(R, t), H, contour, lines.lines, mask_bias, view)

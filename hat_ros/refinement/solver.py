@@ -254,7 +254,8 @@ def fit_contour(
     mask_scales_px: Array,
     edge_scales_px: Array,
     dampings: Array,
-    prior_sigma_rad: float,
+    turned: Array,
+    rotation_info: Array,
     radius_m: float,
 ) -> tuple[Array, Array, Array, Array, float, float]:
     """Fit contour points to a mask's boundary and to the image's own edges, each weighted by its measured variance.
@@ -271,7 +272,9 @@ def fit_contour(
         mask_scales_px: (I,) robust scale of the mask residuals in each iteration, 0 = mask unused.
         edge_scales_px: (I,) robust scale of the edge residuals.
         dampings: (I,) share of the mean information added in every direction, so that what cannot be observed stays.
-        prior_sigma_rad: one sigma of the start's rotation, which holds what the contour says little about; inf = none.
+        turned: (3,) rotation vector from the expected rotation to the start's.
+        rotation_info: (3, 3) information about the expected rotation (1/rad^2), which holds what the contour says
+            little about; zero = none.
         radius_m: bounding radius of the target, which makes rotations and translations commensurate.
 
     Returns:
@@ -287,7 +290,7 @@ def fit_contour(
     shape = (N_PARAMETERS, N_PARAMETERS)
     H = np.zeros(shape)
     mask_bias, edge_bias = 0.0, 0.0
-    turned = np.zeros(3)
+    turned = turned.copy()
     correlation = CORRELATION_PX
     for i in range(n):
         correlation += CORRELATION_SHARE * lines[i, 2]
@@ -347,8 +350,9 @@ def fit_contour(
         g[EDGE_BIAS] -= edge_bias / EDGE_BIAS_PX**2
         A = H.copy()
         for i in range(3):
-            A[i + 3, i + 3] += 1.0 / prior_sigma_rad**2
-            g[i + 3] -= turned[i] / prior_sigma_rad**2
+            for j in range(3):
+                A[i + 3, j + 3] += rotation_info[i, j]
+                g[i + 3] -= rotation_info[i, j] * turned[j]
         ok, step = _damped_solve(A, g, dampings[iteration], radius_m)
         if not ok:
             break

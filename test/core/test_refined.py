@@ -20,7 +20,7 @@ class BasinRefiner:
         self._evidence = evidence or (lambda index: {"true": (0.97, 0.97), "flipped": (0.8, 0.8)})
         self.calls = 0
 
-    def refine(self, frame, detection, T_cam_target):
+    def refine(self, frame, detection, T_cam_target, prior=None):
         self.calls += 1
         index = frame.stamp_ns // 10**8 - 1
         truth = self._scene.T_cam_target[index]
@@ -225,9 +225,9 @@ def test_before_the_alignment_the_constant_rate_says_how_far_the_target_moves(sc
     starts = {}
 
     class Recording(BasinRefiner):
-        def refine(self, frame, detection, T_cam_target):
+        def refine(self, frame, detection, T_cam_target, prior=None):
             starts.setdefault(frame.stamp_ns // 10**8 - 1, T_cam_target)
-            return super().refine(frame, detection, T_cam_target)
+            return super().refine(frame, detection, T_cam_target, prior)
 
     stage = FusionStage(preset("default"), Recording(scene))
     estimates = _run(stage, scene, range(8))

@@ -6,7 +6,7 @@ from shape_scene import CAMERA, picture, pose_errors, random_pose, spacecraft
 from hat_ros import lie
 from hat_ros.config import HatConfig, RefinementConfig
 from hat_ros.refinement import create_refiner
-from hat_ros.types import Detection, Frame
+from hat_ros.types import Detection, Frame, RotationPrior
 
 ENABLED = HatConfig(refinement=RefinementConfig(enabled=True))
 
@@ -44,6 +44,22 @@ def test_a_perturbed_pose_converges(refiner, target, seed):
     assert shift < 0.005
     assert refined.overlap > 0.93
     assert refined.support > 0.9
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_what_is_known_of_the_rotation_holds_it_about_that_axis_alone(refiner, target, wide):
+    """Also over several rounds: what is known refers to the expected rotation, not to each round's start."""
+    rng = np.random.default_rng(5)
+    T_true = random_pose(rng, target)
+    frame, mask = picture(target, T_true)
+    axis, other = np.array([0.0, 0.6, 0.8]), np.array([0.0, -0.8, 0.6])
+    expected = lie.so3_exp(np.radians(1.5) * (axis + other)) @ T_true[:3, :3]
+    start = lie.transform(expected, T_true[:3, 3] * (1.04 if wide else 1.0))
+    known = RotationPrior(expected, 1e9 * np.outer(axis, axis))
+    held = refiner.refine(frame, Detection(mask), start, known)
+    moved = np.degrees(lie.so3_log(held.T_cam_target[:3, :3] @ expected.T))
+    assert abs(moved @ axis) < 0.02
+    assert np.linalg.norm(moved) > 0.3
 
 
 @pytest.mark.parametrize("background", [0, 120])
