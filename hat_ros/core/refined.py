@@ -2,7 +2,8 @@
 
 The paper refines offline and lets SLAM and anchors alone carry the causal pose. Here each frame's prediction (relative
 motion applied to the previous output) is refined on that frame's own image, and an accepted refinement is a measurement
-like an anchor: it becomes the output, and with it the previous output of the next frame.
+like an anchor: it becomes the output, and with it the previous output of the next frame. What the image does not show of
+the rotation stays as predicted, as far as the predictions of late deserve it (``core.attitude``).
 
 At keyframes the selected anchor competes with the track:
 
