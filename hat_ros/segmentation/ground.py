@@ -34,6 +34,7 @@ _STEP = 10  # 8-bit colour difference that counts
 _SAME = 4  # and one that does not
 _ALL_AROUND = 0.85  # share of a mask and its surroundings where the ground is known, for it to be beyond doubt
 _VOUCHED = 0.85  # overlap with what is unlike the ground
+_SHOWN = 0.3  # share of a mask that is unlike the ground
 _CONTRADICTED = 0.5  # share that is ground
 CLEAR = 0.9  # from so many lengths back none of the target is where it is now
 
@@ -60,6 +61,10 @@ class GroundEvidence:
         around = cv2.dilate(mask, _K5)
         known_around = np.count_nonzero(around & self.known) >= _ALL_AROUND * np.count_nonzero(around)
         return known_around and overlap(mask & self.known, self.target) >= _VOUCHED
+
+    def shows(self, mask: Mask) -> bool:
+        """Whether much of a 0/1 mask is seen to stand before the ground."""
+        return np.count_nonzero(mask & self.target) >= _SHOWN * np.count_nonzero(mask)
 
     def contradicts(self, mask: Mask) -> bool:
         """Whether most of a 0/1 mask is ground."""

@@ -157,11 +157,10 @@ class Search:
         seed, models = window.reduce(silhouette), region.ColorModels()
         seen = self.ground.evidence(window, max(w, h))
         cut = region.cut_from_seeds(window.rgb, [seed], margin * window.scale, models, seen)
-        if (
-            cut is None
-            or overlap(cut, seed) < self._config.min_prior_overlap
-            or (seen is not None and seen.contradicts(cut))
-        ):
+        if cut is None or (seen is not None and seen.contradicts(cut)):
+            return None
+        agreement, sighted = overlap(cut, seed), seen is not None and seen.shows(cut)
+        if agreement < (self._config.min_prior_overlap if sighted else AGREEMENT):
             return None
         step = region.color_step(window.rgb)
         contrast = region.edge_contrast(step, cut)
