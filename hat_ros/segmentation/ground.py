@@ -19,6 +19,7 @@ from hat_ros.segmentation.masks import Mask, Window, overlap
 
 _SIDE_PX = 320  # longer side of the frames remembered
 _MAX_POINTS = 80
+_FEW_POINTS = 40  # followed on; with fewer, all are chosen anew
 _MIN_POINTS = 12
 _POINT_QUALITY = 0.005
 _POINT_SPACING_PX = 10
@@ -38,6 +39,7 @@ _SHOWN = 0.3  # share of a mask that is unlike the ground
 _CONTRADICTED = 0.5  # share that is ground
 CLEAR = 0.9  # from so many lengths back none of the target is where it is now
 
+_NO_POINTS = np.zeros((0, 1, 2), np.float32)
 _K3 = np.ones((3, 3), np.uint8)
 _K5 = np.ones((5, 5), np.uint8)
 
@@ -89,6 +91,7 @@ class GroundMemory:
     def reset(self) -> None:
         """Forget earlier frames."""
         self._frames: list[_Remembered] = []
+        self._points = _NO_POINTS
         self._grey: NDArray[np.uint8] | None = None
         self._scale = (1.0, 1.0)
 
@@ -101,13 +104,38 @@ class GroundMemory:
                 size = (small.shape[1], small.shape[0])
                 covered = cv2.resize(mask_before * 255, size, interpolation=cv2.INTER_AREA) > 0
                 self._frames[-1].free = 1 - cv2.dilate(covered.astype(np.uint8), _K5)
-            H = _ground_shift(self._grey, grey, self._frames[-1].free)
-            self._carry(H)
+            else:
+                self._points = _NO_POINTS  # they may have been the target's
+            self._carry(self._follow(grey))
         else:
-            self._frames = []
+            self._frames, self._points = [], _NO_POINTS
         self._frames.append(_Remembered(small, np.ones(grey.shape, np.uint8), np.eye(3)))
         self._grey = grey
         self._scale = (small.shape[1] / rgb.shape[1], small.shape[0] / rgb.shape[0])
+
+    def _follow(self, grey: NDArray[np.uint8]) -> NDArray[np.float64] | None:
+        """(3, 3) homography that most point tracks follow into the next frame outside the target; None without one."""
+        free, points = self._frames[-1].free, self._points
+        if len(points):
+            x, y = np.rint(points[:, 0]).astype(int).T
+            inside = (x >= 0) & (y >= 0) & (x < free.shape[1]) & (y < free.shape[0])
+            points = points[inside]
+            points = points[free[y[inside], x[inside]] > 0]
+        if len(points) < _FEW_POINTS:
+            points = cv2.goodFeaturesToTrack(self._grey, _MAX_POINTS, _POINT_QUALITY, _POINT_SPACING_PX, mask=free)
+        self._points = _NO_POINTS
+        if points is None or len(points) < _MIN_POINTS:
+            return None
+        patch = (_TRACK_PX, _TRACK_PX)
+        tracked, found, _ = cv2.calcOpticalFlowPyrLK(self._grey, grey, points, None, winSize=patch, maxLevel=2)
+        good = found.ravel() == 1
+        if np.count_nonzero(good) < _MIN_POINTS:
+            return None
+        H, follows = cv2.findHomography(points[good], tracked[good], cv2.RANSAC, _MAX_ERROR_PX)
+        if H is None or follows.mean() < _MIN_FOLLOWING:
+            return None
+        self._points = tracked[good][follows.ravel() == 1]
+        return H
 
     def _carry(self, H_next_prev: NDArray[np.float64] | None) -> None:
         """Take the next frame's view; forget what is too close to its neighbour, or all where the ground was lost."""
@@ -117,9 +145,8 @@ class GroundMemory:
         for frame in self._frames:
             frame.H_now_then = H_next_prev @ frame.H_now_then
         height, width = self._grey.shape
-        middle = (width / 2, height / 2)
         if len(self._frames) >= 2:
-            apart = _moved(self._frames[-1].H_now_then, middle) - _moved(self._frames[-2].H_now_then, middle)
+            apart = np.diff(_carried(self._frames[-2:], (width / 2, height / 2)), axis=0)
             if np.linalg.norm(apart) < _SPACING_PX:
                 del self._frames[-1]
         del self._frames[:-_MAX_FRAMES]
@@ -151,15 +178,15 @@ class GroundMemory:
 
     def length_known_px(self, window: Window) -> float:
         """Length of the longest target, in full-resolution pixels, that evidence in a window can show completely."""
-        middle, sx = self._middle(window), self._scale[0]
-        shifts = [float(np.linalg.norm(_moved(frame.H_now_then, middle))) / sx for frame in self._frames[:-1]]
-        usable = [shift for shift in shifts if shift <= _MAX_SHIFT * max(window.width, window.height)]
-        return max(usable, default=0.0) / _LAGS[-1]
+        shifts_px = self._shifts_px(window)
+        usable = shifts_px[shifts_px <= _MAX_SHIFT * max(window.width, window.height)]
+        return float(usable.max(initial=0.0)) / _LAGS[-1]
 
-    def _middle(self, window: Window) -> tuple[float, float]:
-        """A window's middle at the remembered scale."""
+    def _shifts_px(self, window: Window) -> NDArray[np.float64]:
+        """(n,) how far the ground in the middle of a window has moved since each past frame, full resolution."""
         sx, sy = self._scale
-        return (window.x0 + window.width / 2) * sx, (window.y0 + window.height / 2) * sy
+        middle = ((window.x0 + window.width / 2) * sx, (window.y0 + window.height / 2) * sy)
+        return np.linalg.norm(_carried(self._frames[:-1], middle) - middle, axis=1) / sx
 
     def _to_window(self, window: Window) -> NDArray[np.float64]:
         """(3, 3) from the remembered scale to a window's, pixel centres at integers."""
@@ -175,34 +202,21 @@ class GroundMemory:
 
     def _compared(self, window: Window, length_px: float) -> list[tuple[_Remembered, float]]:
         """The frames worth a comparison with the shift of the ground in the window since, full-resolution pixels."""
-        middle, sx = self._middle(window), self._scale[0]
-        past = self._frames[-2::-1]
-        shifts = [float(np.linalg.norm(_moved(frame.H_now_then, middle))) / sx for frame in past]
+        past, shifts_px = self._frames[-2::-1], self._shifts_px(window)[::-1]
         chosen = []
         for lag in _LAGS:
-            far = [i for i, shift in enumerate(shifts) if shift >= max(lag * length_px, _MIN_SHIFT_PX)]
-            if far and far[0] not in chosen:
+            far = np.flatnonzero(shifts_px >= max(lag * length_px, _MIN_SHIFT_PX))
+            if len(far) and far[0] not in chosen:
                 chosen.append(far[0])
-        return [(past[i], shifts[i]) for i in chosen]
+        return [(past[i], float(shifts_px[i])) for i in chosen]
 
 
-def _ground_shift(before: NDArray[np.uint8], now: NDArray[np.uint8], free: Mask) -> NDArray[np.float64] | None:
-    """(3, 3) homography that most point tracks follow outside the target; None when there is none."""
-    points = cv2.goodFeaturesToTrack(before, _MAX_POINTS, _POINT_QUALITY, _POINT_SPACING_PX, mask=free)
-    if points is None or len(points) < _MIN_POINTS:
-        return None
-    tracked, found, _ = cv2.calcOpticalFlowPyrLK(before, now, points, None, winSize=(_TRACK_PX, _TRACK_PX), maxLevel=2)
-    good = found.ravel() == 1
-    if np.count_nonzero(good) < _MIN_POINTS:
-        return None
-    H, follows = cv2.findHomography(points[good], tracked[good], cv2.RANSAC, _MAX_ERROR_PX)
-    return None if H is None or follows.mean() < _MIN_FOLLOWING else H
-
-
-def _moved(H: NDArray[np.float64], at: tuple[float, float]) -> NDArray[np.float64]:
-    """Where a homography's preimage of a point lies from it, (2,)."""
-    x, y, w = np.linalg.solve(H, [at[0], at[1], 1.0])
-    return np.array([x / w - at[0], y / w - at[1]])
+def _carried(frames: list[_Remembered], at: tuple[float, float]) -> NDArray[np.float64]:
+    """(n, 2) where the ground that was at a point in each frame is now."""
+    if not frames:
+        return np.zeros((0, 2))
+    now = np.stack([frame.H_now_then for frame in frames]) @ np.array([*at, 1.0])
+    return now[:, :2] / now[:, 2:]
 
 
 def _least(changes: list[tuple[NDArray[np.uint8], Mask]]) -> tuple[NDArray[np.uint8], Mask]:
