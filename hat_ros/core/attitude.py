@@ -17,14 +17,14 @@ from hat_ros import lie
 from hat_ros.types import Float
 
 # Measured frames between which turns are compared; with fewer than the second nothing is known.
-_HISTORY, _MIN_MEASURED = 14, 5
-# Drifts of the prediction that are told apart, rad per frame; the first is what the best ones deserve, since images
-# err together as well.
+_HISTORY, _MIN_MEASURED = 14, 8
+# Drifts of the prediction that are told apart, rad per frame; none is trusted more than the first.
 _DRIFTS_RAD = np.radians(np.geomspace(0.25, 5.0, 24))
 # Degrees of freedom of the heavy-tailed likelihood: one bad mask says little.
 _TAIL = 4.0
-# The largest drift that is less likely by no more than this is assumed: trust has to be earned.
-_MARGIN = 4.0
+# The largest drift whose log-likelihood is short of the best by no more than this is assumed: trust has to be earned,
+# and successive images err together.
+_MARGIN = 8.0
 
 
 class _Measured(NamedTuple):
