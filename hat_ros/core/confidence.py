@@ -41,6 +41,10 @@ class BasinConfidence:
         self.margin = selection.margin(R, self._apart_deg)
         self._appearance.append(selection.appearance_margin(R, self._apart_deg))
 
+    def decides(self, selection: Selection, T_cam_target: Float) -> bool:
+        """Whether a keyframe's decoder clearly prefers the basin of a pose (4, 4)."""
+        return selection.margin(T_cam_target[:3, :3], self._apart_deg) >= self._config.min_margin
+
     def vouches(self, confirmed: bool) -> bool:
         """Whether the output's basin is beyond doubt; ``confirmed`` by the image or a second anchor, or not."""
         if self.margin < self._config.min_margin or min(self._appearance, default=0.0) < 0.0:

@@ -70,7 +70,8 @@ class FusionStage:
         if anchor is not None:
             confidence = self._area_confidence.update(box_area_px(selection.candidates.box_xyxy))
         if self._refined is not None:
-            fused = self._refined.update(frame, detection, motion, anchor, confidence)
+            decided = anchor is not None and self._confidence.decides(selection, anchor)
+            fused = self._refined.update(frame, detection, motion, anchor, confidence, decided)
         else:
             fused = self._causal.update(motion, anchor, confidence)
         self._n_resets += fused.reset

@@ -2,15 +2,15 @@
 
 The paper refines offline and lets SLAM and anchors alone carry the causal pose. Here each frame's prediction (relative
 motion applied to the previous output) is refined on that frame's own image, and an accepted refinement is a measurement
-like an anchor: it becomes the output, and with it the previous output of the next frame. What the image does not show of
-the rotation stays as predicted, as far as the predictions of late deserve it (``core.attitude``).
+like an anchor: it becomes the output, and with it the previous output of the next frame. What the image does not show
+of the rotation stays as predicted, as far as the predictions of late deserve it (``core.attitude``).
 
 At keyframes the selected anchor competes with the track:
 
 * Within D of the track it is one basin, and the anchor one more start for the refinement: the best result wins.
 * Beyond D it is a rival. Successive rivals that follow from each other (the paper's coherence) add up, and so does
   their lead in image evidence over the track. A rival takes over once it is supported and leads by
-  ``arbitration_margin``, or once as many coherent rivals stand against the track as anchors stood for it
+  ``arbitration_margin``, or once as many coherent rivals stand against the track as anchors clearly stood for it
   (``reset_anchors`` at most, as in the paper), unless the image speaks against them by that margin.
 
 With no refinement supported, the output is what the paper's fusion makes of prediction and anchor, and it coasts. A
@@ -71,14 +71,23 @@ class RefinedFusion:
         self._forget_rivals()
 
     def update(
-        self, frame: Frame, detection: Detection | None, motion: Motion, anchor: Float | None, confidence: float
+        self,
+        frame: Frame,
+        detection: Detection | None,
+        motion: Motion,
+        anchor: Float | None,
+        confidence: float,
+        decided: bool,
     ) -> Fused:
-        """Advance by one frame; arguments as :meth:`CausalFusion.update`, beside the image."""
+        """Advance by one frame; arguments as :meth:`CausalFusion.update`, beside the image.
+
+        ``decided``: the decoder prefers the anchor's basin clearly. An anchor that barely won speaks for no track.
+        """
         if motion.epoch != self._epoch:
             self._epoch = motion.epoch
             self.alignment.reset()
         predictions = self._predictions(frame.stamp_ns, motion)
-        fused = self._decide(frame, detection, predictions, anchor, confidence)
+        fused = self._decide(frame, detection, predictions, anchor, confidence, decided)
         if fused.reset:
             self.alignment.reset()
         if fused.measurement is not None:
@@ -98,6 +107,7 @@ class RefinedFusion:
         predictions: list[Float],
         anchor: Float | None,
         confidence: float,
+        decided: bool,
     ) -> Fused:
         if not predictions:
             return self._start(frame, detection, anchor)
@@ -109,7 +119,7 @@ class RefinedFusion:
         reference = track.T_cam_target if is_supported(track, self._refinement) else predicted
         if not self._dissent.update(anchor, reference):
             self._forget_rivals()
-            self._n_agreed += 1
+            self._n_agreed += decided
             self._n_disagreed = 0
             return self._agree(frame, detection, track, predicted, anchor, confidence)
         return self._arbitrate(frame, detection, track, predicted, anchor)

@@ -216,7 +216,11 @@ class Window:
         problem = self._problem(False)._replace(X_expected=X.copy())
         cost, _ = self._descend((R, t, X), problem, _RIVAL_ITERATIONS)
         if self.trusts_prior:
-            self._distrust_for((R, t, X), cost)
+            # Freed of the prior any structure fits better: the reversed one must beat the present one as free as it is.
+            present = self.R.copy(), self.t.copy(), self.X.copy()
+            present_cost, _ = self._descend(present, self._problem(False), _RIVAL_ITERATIONS)
+            if cost < _RIVAL_SHARE * present_cost - _RIVAL_MARGIN:
+                self._distrust_for((R, t, X), cost)
             return
         is_better = cost < _RIVAL_SHARE * self.cost - _RIVAL_MARGIN
         is_as_good = cost < self.cost / _RIVAL_SHARE + _RIVAL_MARGIN

@@ -36,23 +36,27 @@ class BasinRefiner:
         self.calls = 0
 
 
-def _selection(T_cam_target):
-    candidates = Candidates.from_matrices(T_cam_target[None], np.zeros(1))
-    return Selection(candidates, np.zeros(1), np.zeros(1), 0)
+def _selection(T_cam_target, lead=np.inf):
+    """An anchor, and a candidate half a turn away that it leads by so much."""
+    if np.isinf(lead):
+        candidates = Candidates.from_matrices(T_cam_target[None], np.zeros(1))
+        return Selection(candidates, np.zeros(1), np.zeros(1), 0)
+    score = np.array([0.0, -lead])
+    return Selection(Candidates.from_matrices(np.stack([T_cam_target, _flipped(T_cam_target)]), score), score, score, 0)
 
 
 def _flipped(T):
     return lie.transform(T[:3, :3] @ HALF_TURN, T[:3, 3])
 
 
-def _run(stage, scene, frames, anchor=lambda i, T: T, moving=True):
-    """``anchor(i, truth)`` gives the anchor at keyframes, or None."""
+def _run(stage, scene, frames, anchor=lambda i, T: T, moving=True, lead=np.inf):
+    """``anchor(i, truth)`` gives the anchor at keyframes, or None; ``lead`` is its lead over half a turn from it."""
     out = []
     for i in frames:
         T = anchor(i, scene.T_cam_target[i]) if scene.observations.key[i] else None
         frame = Frame((i + 1) * 10**8, np.zeros((1, 1, 3), np.uint8), Camera(np.eye(3), 1, 1))
         motion = scene.observations.motion(i) if moving else Motion.none()
-        out.append(stage.update(frame, None, motion, Selection.none() if T is None else _selection(T)))
+        out.append(stage.update(frame, None, motion, Selection.none() if T is None else _selection(T, lead)))
     return out
 
 
@@ -200,6 +204,19 @@ def test_a_rival_must_outnumber_the_anchors_behind_the_track(scene):
         switched_at = 8 * n_for + 8 * (min(n_for, 4) - 1)
         assert (errors[:switched_at] > 170).all()
         assert (errors[switched_at:] < 1e-5).all()
+
+
+@pytest.mark.parametrize(("lead", "left_after"), [(1.0, 1), (6.0, 4)])
+def test_anchors_that_barely_won_give_a_track_no_seniority(scene, lead, left_after):
+    """The decoder remembers how close it was: where it changes its mind, as many more anchors would only be late."""
+    keyframes = np.flatnonzero(scene.observations.key)
+    stage = _stage(scene, lambda _: {"true": (0.8, 0.8), "flipped": (0.8, 0.8)})
+    turned = keyframes[4]
+    _run(stage, scene, range(turned), lambda i, T: _flipped(T), lead=lead)
+    frames = range(turned, keyframes[9])
+    errors = _errors(_run(stage, scene, frames), scene, frames)
+    left = turned + int(np.argmax(errors < 90))
+    assert left == keyframes[4 + left_after - 1]
 
 
 def test_evidence_is_what_can_be_seen():

@@ -56,6 +56,19 @@ def test_a_surface_that_explains_the_tracks_is_believed_however_wrong_the_motion
     assert np.linalg.norm(turn - 9 * _STEP) < np.radians(0.5)
 
 
+def test_a_trusted_surface_is_not_left_for_the_reversed_relief_because_that_is_free_of_it(wrong_window):
+    """Seen from afar both fit once they are free, and the present one is what the fused poses follow."""
+    window = wrong_window
+    window.R = np.stack([_rotation(i) for i in range(10)])
+    window.X = _points() + np.random.default_rng(1).normal(scale=0.1 * _RADIUS, size=(_N, 3))
+    window.X_guess = window.X.copy()
+    window.trusts_prior = True
+    before = window.R.copy()
+    window.challenge_structure()
+    assert window.trusts_prior
+    assert np.array_equal(window.R, before)
+
+
 def test_a_common_turn_of_all_poses_and_points_costs_nothing(wrong_window):
     window, turn = wrong_window, lie.so3_exp(np.array([0.4, -0.2, 0.7]))
     here = window._free_cost(window.R, window.t, window.X)
