@@ -13,7 +13,7 @@ that did not compete would lose to chance.
 Unless the best candidate is where a healthy track expects it, more is tried. A mask that no view fits well is matched
 as part of a silhouette. Before a black sky the mask holds what is lit, which need not be the whole target: matches of
 brightness (``lit_bank``) compete as well, and of those only the sunlit part of the contour is compared with the mask.
-Where no candidate leads clearly after that, more shape matches are tried.
+Before anything else more shape matches are tried where no candidate leads clearly.
 """
 
 from __future__ import annotations
@@ -140,8 +140,8 @@ class TemplateHypotheses:
             # What lies in shadow is missing from the mask: compare what is bright.
             lit = self._align(self._sunlit(starts, frame, scorer) + self._coarse_lit(frame, scorer), frame, scorer)
             scored += self._finish(lit, frame, scorer)
-        if not self._is_clear(scored, prior):
-            further = self._coarse(placements, frame, field, _MORE_COARSE * self._options.n_coarse)[n_coarse:]
+        elif not self._is_clear(scored, prior):
+            further = self._coarse(placements, frame, field, _MORE_COARSE * self._options.n_coarse, n_coarse)
             aligned += self._align(further, frame, scorer)
             more = self._select(aligned, 2 * self._max_candidates)
             scored += self._finish([start for start in more if start not in selected], frame, scorer)
@@ -155,8 +155,10 @@ class TemplateHypotheses:
     def reset(self) -> None:
         """Nothing to forget: every keyframe stands for itself."""
 
-    def _coarse(self, placements: list[Placement], frame: Frame, field: MaskField, n_coarse: int) -> list[Start]:
-        """The best shape matches, pulled onto the mask's boundary."""
+    def _coarse(
+        self, placements: list[Placement], frame: Frame, field: MaskField, n_coarse: int, n_known: int = 0
+    ) -> list[Start]:
+        """The best shape matches after those that are known already, pulled onto the mask's boundary."""
         options = self._options
         matches = match_shape(
             self._bank,
@@ -167,7 +169,8 @@ class TemplateHypotheses:
             options.separation_deg,
             self._target.center_m,
         )
-        return [Start(T) for T in self._pulled(self._bank, matches, frame, field)]
+        further = ShapeMatches(matches.T_cam_target[n_known:], matches.view[n_known:], matches.score[n_known:])
+        return [Start(T) for T in self._pulled(self._bank, further, frame, field)]
 
     def _coarse_lit(self, frame: Frame, scorer: Scorer) -> list[Start]:
         """Matches of brightness, the best explained by sunlight first."""
