@@ -199,6 +199,19 @@ class Candidates:
         """(K, 4, 4) poses."""
         return lie.matrix_from_row(self.pose_rows)
 
+    def lead(self, apart_deg: float) -> float:
+        """Lead in log score of the best one over those further than an angle from it.
+
+        Infinite without any such, NaN without surviving candidates.
+        """
+        survives = np.isfinite(self.log_score)
+        if not survives.any():
+            return float("nan")
+        best = int(np.argmax(self.log_score))
+        R = self.T_cam_target[:, :3, :3]
+        elsewhere = lie.angle_between(R, R[best]) > np.radians(apart_deg)
+        return float(self.log_score[best] - self.log_score[elsewhere & survives].max(initial=-np.inf))
+
 
 @dataclass(frozen=True)
 class Motion:

@@ -127,3 +127,14 @@ def test_margin_is_the_lead_of_a_basin_over_the_best_other_one():
     assert selection.margin(lie.so3_exp(np.array([2.0, 0, 0])), 30.0) == -np.inf
     assert selection.appearance_margin(R[0], 30.0) == 6.0
     assert np.isnan(Selection.none().margin(R[0], 30.0))
+
+
+def test_lead_of_candidates_is_over_other_basins_that_survive():
+    turns = np.radians([0.0, 10.0, 90.0, 170.0])
+    T = lie.transform(lie.so3_exp(np.outer(turns, [0, 0, 1])), np.tile([0.0, 0, 5], (4, 1)))
+    candidates = Candidates.from_matrices(T, [5.0, 4.5, -np.inf, 2.0])
+    assert candidates.lead(30.0) == 3.0
+    assert candidates.lead(5.0) == 0.5
+    assert candidates.lead(175.0) == np.inf
+    assert np.isnan(Candidates.none().lead(30.0))
+    assert np.isnan(Candidates.from_matrices(T, [-np.inf] * 4).lead(30.0))

@@ -15,13 +15,13 @@ class KeyframeSchedule:
     opportunity stays open for the next frame that has one.
 
     Our extension: while a track is settled, an absolute estimate has little to add, and the gap is
-    ``settled_factor`` times as long. The second attempt of all comes as many times sooner: a first one that was wrong
-    would stand until then. The paper's spacing is a factor of 1.
+    ``settled_factor`` times as long; and a first attempt that decided nothing is repeated as many times sooner, since a
+    wrong start stands until then. The paper's spacing is a factor of 1.
     """
 
     def __init__(self, config: KeyframeConfig) -> None:
         self._gap_frames = config.gap_frames
-        self._second_gap_frames = max(1, config.gap_frames // config.settled_factor)
+        self._early_gap_frames = max(1, config.gap_frames // config.settled_factor)
         self._settled_gap_frames = config.gap_frames * config.settled_factor
         self.reset()
 
@@ -37,8 +37,8 @@ class KeyframeSchedule:
             self._healthy_attempts = 0
         settled = self._healthy_attempts >= SETTLING_ATTEMPTS
         gap_frames = self._settled_gap_frames if settled else self._gap_frames
-        if self._n_attempts == 1:
-            gap_frames = self._second_gap_frames
+        if self._n_attempts == 1 and not self._decided:
+            gap_frames = self._early_gap_frames
         if not has_detection or self._frames_since_attempt < gap_frames:
             return False
         self._frames_since_attempt = 0
@@ -46,8 +46,13 @@ class KeyframeSchedule:
         self._healthy_attempts += healthy
         return True
 
+    def answered(self, decided: bool) -> None:
+        """What came of the last attempt: whether one basin clearly leads."""
+        self._decided = decided
+
     def reset(self) -> None:
         """The next frame with a detection is an opportunity."""
         self._frames_since_attempt = self._gap_frames
         self._n_attempts = 0
+        self._decided = True
         self._healthy_attempts = 0

@@ -22,6 +22,7 @@ class HypothesisStage:
         self._max_candidates = config.hypotheses.max_candidates
         self._drop_implausible = config.hypotheses.guard
         self._schedule = KeyframeSchedule(config.keyframes)
+        self._apart_deg, self._min_lead = config.fusion.gate_angle_deg, config.refinement.min_margin
         self._backend = create_backend("hypotheses", config, target)
 
     def update(self, frame: Frame, detection: Detection | None, prior: PosePrior | None) -> Candidates:
@@ -37,7 +38,9 @@ class HypothesisStage:
         if len(candidates) > self._max_candidates:
             keep = slice(self._max_candidates)
             candidates = Candidates(candidates.pose_rows[keep], candidates.log_score[keep], candidates.box_xyxy)
-        return guard_candidates(candidates, self._drop_implausible)
+        candidates = guard_candidates(candidates, self._drop_implausible)
+        self._schedule.answered(decided=candidates.lead(self._apart_deg) >= self._min_lead)
+        return candidates
 
     def reset(self) -> None:
         """Forget earlier frames; the next frame with a detection is a keyframe."""

@@ -35,15 +35,25 @@ def test_a_settled_track_is_asked_less_often_until_it_is_in_doubt():
     schedule = KeyframeSchedule(KeyframeConfig(gap_frames=4, settled_factor=3))
     healthy = [2 <= i < 42 for i in range(60)]
     asked = [i for i in range(60) if schedule.update(True, healthy[i])]
-    # Frame 0 is looked at again soon; 5, 9 and 13 settle it; doubt at 42 asks again at once, its gap being over.
-    assert asked == [0, 1, 5, 9, 13, 25, 37, 42, 46, 50, 54, 58]
+    # Frame 0 is not healthy yet; 4, 8 and 12 settle it; doubt at 42 asks again at once, its gap being over.
+    assert asked == [0, 4, 8, 12, 24, 36, 42, 46, 50, 54, 58]
 
 
-def test_the_first_attempt_is_soon_checked_by_a_second():
+def _asked(schedule, decided):
+    out = []
+    for i in range(20):
+        if schedule.update(True):
+            out.append(i)
+            schedule.answered(decided)
+    return out
+
+
+def test_a_first_attempt_that_decided_nothing_is_soon_repeated():
     schedule = KeyframeSchedule(KeyframeConfig(gap_frames=6, settled_factor=3))
-    assert [i for i in range(20) if schedule.update(True)] == [0, 2, 8, 14]
+    assert _asked(schedule, decided=False) == [0, 2, 8, 14]
     schedule.reset()
-    assert [i for i in range(20) if schedule.update(True)] == [0, 2, 8, 14]
+    assert _asked(schedule, decided=True) == [0, 6, 12, 18]
+    assert _asked(KeyframeSchedule(KeyframeConfig(gap_frames=6)), decided=False) == [0, 6, 12, 18]
 
 
 def test_health_changes_nothing_with_a_factor_of_one():
