@@ -200,17 +200,16 @@ class Candidates:
         return lie.matrix_from_row(self.pose_rows)
 
     def lead(self, apart_deg: float) -> float:
-        """Lead in log score of the best one over those further than an angle from it.
-
-        Infinite without any such, NaN without surviving candidates.
-        """
-        survives = np.isfinite(self.log_score)
-        if not survives.any():
+        """Lead in log score of the best one's basin over the best outside it, as :meth:`Selection.margin`."""
+        if not np.isfinite(self.log_score).any():
             return float("nan")
         best = int(np.argmax(self.log_score))
-        R = self.T_cam_target[:, :3, :3]
-        elsewhere = lie.angle_between(R, R[best]) > np.radians(apart_deg)
-        return float(self.log_score[best] - self.log_score[elsewhere & survives].max(initial=-np.inf))
+        return self.lead_of(self.T_cam_target[best, :3, :3], self.log_score, apart_deg)
+
+    def lead_of(self, R_cam_target: Float, score: Float, apart_deg: float) -> float:
+        """Lead in a score (K,) of the candidates within an angle of an orientation (3, 3) over all others."""
+        near = lie.angle_between(self.T_cam_target[:, :3, :3], R_cam_target) <= np.radians(apart_deg)
+        return float(score[near].max(initial=-np.inf) - score[~near].max(initial=-np.inf))
 
 
 @dataclass(frozen=True)
@@ -297,9 +296,7 @@ class Selection:
     def _lead(self, score: Float, R_cam_target: Float, apart_deg: float) -> float:
         if self.selected < 0:
             return float("nan")
-        apart_rad = lie.angle_between(self.candidates.T_cam_target[:, :3, :3], R_cam_target)
-        near = apart_rad <= np.radians(apart_deg)
-        return float(score[near].max(initial=-np.inf) - score[~near].max(initial=-np.inf))
+        return self.candidates.lead_of(R_cam_target, score, apart_deg)
 
     @property
     def anchor(self) -> Float | None:

@@ -28,11 +28,16 @@ _MARGIN = 8.0
 
 
 class _Measured(NamedTuple):
-    """What one image said: frame number, turn predicted since the track began, rotation, covariance."""
+    """What one image said, carried back to the track's first frame by the predictions: drift is what sets two apart.
+
+    Attributes:
+        number: of the frame.
+        R: (3, 3) rotation.
+        covariance: (3, 3) of its rotation vector, axes of the first frame.
+    """
 
     number: int
-    carried: Float
-    R_cam_target: Float
+    R: Float
     covariance: Float
 
 
@@ -77,24 +82,26 @@ class AttitudeFilter:
         innovation = lie.so3_log(R_cam_target @ R_predicted.T)
         # Where the image alone would have put it: the result balances both.
         alone = lie.so3_exp(innovation + covariance @ self._information @ innovation) @ R_predicted
-        self._measured.append(_Measured(self._number, self._carried, alone, covariance))
+        self._remember(alone, covariance)
         self._covariance = np.linalg.inv(self._information + np.linalg.inv(covariance))
 
     def restart(self, R_cam_target: Float, covariance: Float) -> None:
         """The track stands where an image alone has put it, with its (3, 3) covariance."""
-        self._measured.append(_Measured(self._number, self._carried, R_cam_target, covariance))
+        self._remember(R_cam_target, covariance)
         self._covariance = covariance
+
+    def _remember(self, R_cam_target: Float, covariance: Float) -> None:
+        back = self._carried.T
+        self._measured.append(_Measured(self._number, back @ R_cam_target, back @ covariance @ back.T))
 
     def drift_rad(self) -> float:
         """Largest drift of the prediction, per frame and axis, that recent images make likely."""
         if len(self._measured) < _MIN_MEASURED:
             return self._start_sigma_rad
-        number, carried, R, covariance = (np.stack(column) for column in zip(*self._measured, strict=True))
+        number, R, covariance = (np.stack(column) for column in zip(*self._measured, strict=True))
         a, b = np.triu_indices(len(number), 1)
-        turn = carried[b] @ carried[a].transpose(0, 2, 1)
-        missed = lie.so3_log(R[b] @ (turn @ R[a]).transpose(0, 2, 1))
-        values, axes = np.linalg.eigh(covariance[b] + turn @ covariance[a] @ turn.transpose(0, 2, 1))
-        along = np.einsum("nij,ni->nj", axes, missed)
+        values, axes = np.linalg.eigh(covariance[a] + covariance[b])
+        along = np.einsum("nij,ni->nj", axes, lie.so3_log(R[b] @ R[a].transpose(0, 2, 1)))
         variance = values + (_DRIFTS_RAD[:, None] * (number[b] - number[a]))[..., None] ** 2
         distance_sq = (along**2 / variance).sum(axis=-1)
         log_likelihood = -0.5 * np.log(variance).sum(axis=-1) - 0.5 * (_TAIL + 3) * np.log1p(distance_sq / _TAIL)
