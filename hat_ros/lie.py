@@ -100,23 +100,16 @@ def quat_from_matrix(R: Array) -> Array:
     R = np.asarray(R, dtype=np.float64)
     if R.ndim == 2:
         return _quat_from_matrix_single(R)
-    m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
-    # Four times the square of each component; dividing by the largest keeps full precision everywhere.
-    squares = np.stack([1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22, 1 + m00 + m11 + m22], axis=-1)
-    d21, d02, d10 = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
-    s01, s02, s12 = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
-    rows = np.stack(
-        [
-            np.stack([squares[..., 0], s01, s02, d21], axis=-1),
-            np.stack([s01, squares[..., 1], s12, d02], axis=-1),
-            np.stack([s02, s12, squares[..., 2], d10], axis=-1),
-            np.stack([d21, d02, d10, squares[..., 3]], axis=-1),
-        ],
-        axis=-2,
-    )
-    best = np.argmax(squares, axis=-1)
-    q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    # Products of each component with all four, four times: the row of the largest keeps full precision everywhere.
+    products = np.empty(R.shape[:-2] + (4, 4))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        products[..., i, i] = 1 + R[..., i, i] - R[..., j, j] - R[..., k, k]
+        products[..., i, j] = products[..., j, i] = R[..., i, j] + R[..., j, i]
+        products[..., k, 3] = products[..., 3, k] = R[..., j, i] - R[..., i, j]
+    products[..., 3, 3] = 1 + R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2]
+    best = np.argmax(np.diagonal(products, axis1=-2, axis2=-1), axis=-1)
+    q = np.take_along_axis(products, best[..., None, None], axis=-2)[..., 0, :]
+    q /= np.sqrt(np.einsum("...i,...i->...", q, q))[..., None]
     return np.where(q[..., 3:] < 0, -q, q)
 
 

@@ -9,6 +9,7 @@ not tell these apart; the turns between what single images said do.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -59,7 +60,10 @@ class AttitudeFilter:
         self._information = self._start_information
         self._number = 0
         self._carried = np.eye(3)
-        self._measured: deque[_Measured] = deque(maxlen=_HISTORY)
+        self._measured: deque[_Measured] = deque()
+        # Of each with those before it, and all drifts; slots are taken in turn.
+        self._log_likelihood = np.zeros((_HISTORY, _HISTORY, len(_DRIFTS_RAD)))
+        self._slot = 0
 
     def predict(self, turn: Float) -> Float:
         """Advance by one frame with a predicted turn (3, 3): information (3, 3) about the rotation it leads to."""
@@ -92,19 +96,32 @@ class AttitudeFilter:
 
     def _remember(self, R_cam_target: Float, covariance: Float) -> None:
         back = self._carried.T
-        self._measured.append(_Measured(self._number, back @ R_cam_target, back @ covariance @ back.T))
+        newest = _Measured(self._number, back @ R_cam_target, back @ covariance @ back.T)
+        if len(self._measured) == _HISTORY:
+            self._measured.popleft()
+        self._log_likelihood[self._slot] = self._log_likelihood[:, self._slot] = 0.0
+        n = len(self._measured)
+        if n:
+            slots = (self._slot - np.arange(n, 0, -1)) % _HISTORY
+            self._log_likelihood[self._slot, slots] = _log_likelihood(newest, self._measured)
+        self._measured.append(newest)
+        self._slot = (self._slot + 1) % _HISTORY
 
     def drift_rad(self) -> float:
         """Largest drift of the prediction, per frame and axis, that recent images make likely."""
-        if len(self._measured) < _MIN_MEASURED:
+        n = len(self._measured)
+        if n < _MIN_MEASURED:
             return self._start_sigma_rad
-        number, R, covariance = (np.stack(column) for column in zip(*self._measured, strict=True))
-        a, b = np.triu_indices(len(number), 1)
-        values, axes = np.linalg.eigh(covariance[a] + covariance[b])
-        along = np.einsum("nij,ni->nj", axes, lie.so3_log(R[b] @ R[a].transpose(0, 2, 1)))
-        variance = values + (_DRIFTS_RAD[:, None] * (number[b] - number[a]))[..., None] ** 2
-        distance_sq = (along**2 / variance).sum(axis=-1)
-        log_likelihood = -0.5 * np.log(variance).sum(axis=-1) - 0.5 * (_TAIL + 3) * np.log1p(distance_sq / _TAIL)
         # Each measurement takes part in many pairs, and says only once what it says.
-        log_likelihood = log_likelihood.mean(axis=1) * len(number)
+        log_likelihood = self._log_likelihood.sum(axis=(0, 1)) * (2.0 / (n - 1))
         return float(_DRIFTS_RAD[log_likelihood >= log_likelihood.max() - _MARGIN][-1])
+
+
+def _log_likelihood(newest: _Measured, earlier: Iterable[_Measured]) -> Float:
+    """Of the turns since each of n earlier measurements, for each drift: (n, drifts)."""
+    number, R, covariance = (np.stack(column) for column in zip(*earlier, strict=True))
+    values, axes = np.linalg.eigh(covariance + newest.covariance)
+    along = np.einsum("nij,ni->nj", axes, lie.so3_log(newest.R @ R.transpose(0, 2, 1)))
+    variance = values[:, None] + ((newest.number - number)[:, None] * _DRIFTS_RAD)[..., None] ** 2
+    distance_sq = (along[:, None] ** 2 / variance).sum(axis=-1)
+    return -0.5 * np.log(variance).sum(axis=-1) - 0.5 * (_TAIL + 3) * np.log1p(distance_sq / _TAIL)

@@ -7,6 +7,7 @@ have already arrived: so the answer is the same in one process and in five.
 from __future__ import annotations
 
 from collections import OrderedDict
+from functools import cache
 
 import numpy as np
 
@@ -115,12 +116,18 @@ def extrapolate(stamps_ns: np.ndarray, T_cam_target: Float, stamp_ns: int) -> Fl
     seconds = (stamps_ns - stamps_ns[-1]) * 1e-9
     turns = lie.so3_log(T_cam_target[:, :3, :3] @ newest[:3, :3].T)
     tangent = np.concatenate([T_cam_target[:, :3, 3], turns], axis=1)
-    first, second = np.triu_indices(len(seconds), k=1)
+    first, second = _pairs(len(seconds))
     slopes = (tangent[second] - tangent[first]) / (seconds[second] - seconds[first])[:, None]
     rate = _median(slopes)
     offset = _median(tangent - seconds[:, None] * rate)
     ahead = offset + rate * ((stamp_ns - int(stamps_ns[-1])) * 1e-9)
     return lie.row_from_matrix(lie.transform(lie.so3_exp(ahead[3:]) @ newest[:3, :3], ahead[:3]))
+
+
+@cache
+def _pairs(n: int) -> tuple[np.ndarray, ...]:
+    """Indices of all pairs of n, the earlier and the later one; n is small and hardly varies."""
+    return np.triu_indices(n, k=1)
 
 
 def _median(values: Float) -> Float:
