@@ -133,7 +133,7 @@ class RegionTracker:
         view = self._viewer.view(T_cam_target, camera, RENDER_PX)
         if view is None:
             return None
-        lines = contour_lines(view, T_cam_target, N_LINES)
+        lines = contour_lines(view, N_LINES)
         flat = np.column_stack([lines.lines[:, :2], np.zeros(len(lines.lines))])
         depth_m = (lines.points_m @ T_cam_target[:3, :3].T + T_cam_target[:3, 3])[:, 2]
         metres = depth_m / camera.K[0, 0]

@@ -13,7 +13,7 @@ from hat_ros.refinement.refiner import WITH_MASK, WITHOUT_MASK, Fit, PoseFitter
 from hat_ros.refinement.sunlight import SunMatcher
 from hat_ros.refinement.view import MaskField, Overlap, TargetViewer, View
 from hat_ros.target import Target
-from hat_ros.types import Camera, Detection, Frame, Refined, RotationPrior
+from hat_ros.types import Detection, Frame, Refined, RotationPrior
 
 # The mask's robust scales are meant for a target of this size or more and shrink with smaller ones.
 _USUAL_SIZE_PX = 250.0
@@ -76,10 +76,10 @@ class FusedPoseRefiner:
             return None
         focal_px = float(frame.camera.K[0, 0])
         covariance = covariance + outline_floor(fit.T_cam_target, focal_px, self._target.bounding_radius_m)
-        # The last round starts close to where it ends: its view is the result's, but for a pixel or two at most.
         overlap = visible_overlap = float("nan")
         if field is not None:
-            areas = field.compare(fit.view, luma)
+            # The last round starts close to where it ends: its view, shifted, shows what the result looks like.
+            areas = field.compare(fit.view.shifted(fit.shift_px), luma)
             overlap, visible_overlap = areas.union_share, areas.visible_share
         return Refined(lie.row_from_matrix(fit.T_cam_target), covariance, overlap, fit.support, visible_overlap)
 
@@ -95,7 +95,7 @@ class FusedPoseRefiner:
         view = self._viewer.view(start, frame.camera, self._config.render_px)
         fit = self._fine(frame, field, start, prior, view)
         if fit is None and field is not None:
-            centred = self._fitter.centred(start, frame.camera, field, luma)
+            centred = self._fitter.centred(start, frame.camera, field, luma, view)
             if centred is not start:
                 start, view = centred, self._viewer.view(centred, frame.camera, self._config.render_px)
                 fit = self._fine(frame, field, start, prior, view)
@@ -116,7 +116,8 @@ class FusedPoseRefiner:
         fit = self._fitter.fit(start, frame.camera, frame.rgb, field, rounds, prior, view=view)
         if fit.support < _ENOUGH_SUPPORT:
             return None
-        return fit if self._largest_move_px(start, fit.T_cam_target, frame.camera) <= _SMALL_MOVE_PX else None
+        # The view is the start's.
+        return fit if np.hypot(*fit.shift_px) + fit.twist_px <= _SMALL_MOVE_PX else None
 
     def _fit_all(
         self,
@@ -136,13 +137,6 @@ class FusedPoseRefiner:
 
     def reset(self) -> None:
         """Nothing to forget: every frame stands for itself."""
-
-    def _largest_move_px(self, T_before: NDArray[np.float64], T_after: NDArray[np.float64], camera: Camera) -> float:
-        """Largest displacement in the image of six points around the target."""
-        out = self._target.bounding_radius_m * np.concatenate([np.eye(3), -np.eye(3)])
-        points = self._target.center_m + out
-        before, after = (camera.project(points @ T[:3, :3].T + T[:3, 3]) for T in (T_before, T_after))
-        return float(np.linalg.norm(after - before, axis=1).max())
 
     def _same_basin(self, T_before: NDArray[np.float64], T_after: NDArray[np.float64]) -> bool:
         turn = np.degrees(lie.angle_between(T_before[:3, :3], T_after[:3, :3]))

@@ -14,6 +14,8 @@ from hat_ros.types import Camera, Frame, RotationPrior
 
 _NO_DISTANCE = np.zeros((2, 2), np.float32)
 _NO_ORIGIN = np.zeros(2)
+# Parts of the target that moved so far against the rest, pixels, leave its contour what it is.
+_SAME_CONTOUR_PX = 1.0
 # A contour point agrees with the image when its edge or the mask's boundary lies this close, pixels.
 _AGREE_PX = 2.5
 # Damping while only the mask's outline is known and the start is far off.
@@ -62,7 +64,9 @@ class Fit:
         contour: (N, 5) as returned by the solver.
         lines: (N, 5) of the contour it belongs to.
         mask_bias_px: how far outside the target's outline the mask's lies, as estimated.
-        view: rendered at the start of the last round.
+        view: whose contour it is: rendered at the start of the last round, or at a pose that looks like it.
+        shift_px: (2,) how far the target's middle lies from there in the image.
+        twist_px: how far its parts lie from there besides, at most.
     """
 
     T_cam_target: NDArray[np.float64]
@@ -71,6 +75,8 @@ class Fit:
     lines: NDArray[np.float64]
     mask_bias_px: float
     view: View
+    shift_px: NDArray[np.float64]
+    twist_px: float
 
     @property
     def outline_px(self) -> float:
@@ -117,11 +123,13 @@ class PoseFitter:
         T = T_cam_target
         fit = None
         for schedule in rounds:
+            if fit is not None and fit.twist_px > _SAME_CONTOUR_PX:
+                view = None
             view = view or self.viewer.view(T, camera, self._render_px, to_sun_cam)
             if view is None:
                 return None
             fit = self.iterate(T, view, camera, image, field, schedule, prior)
-            T, view = fit.T_cam_target, None
+            T = fit.T_cam_target
         return fit
 
     def pull(
@@ -155,9 +163,16 @@ class PoseFitter:
         return lie.transform(R, t)
 
     def centred(
-        self, T_cam_target: NDArray[np.float64], camera: Camera, field: MaskField, luma: NDArray[np.uint8]
+        self,
+        T_cam_target: NDArray[np.float64],
+        camera: Camera,
+        field: MaskField,
+        luma: NDArray[np.uint8],
+        view: View | None = None,
     ) -> NDArray[np.float64]:
         """The start moved sideways so that silhouette and mask share their centroid, if that covers the mask.
+
+        The view of the start, of any size, spares its rendering.
 
         Rotation is predicted better than position: a target that drifts across the image leaves the capture range of
         the outline long before it turns out of it.
@@ -165,7 +180,7 @@ class PoseFitter:
         best, least = T_cam_target, np.inf
         T = T_cam_target
         for _ in range(_CENTRING_STEPS):
-            view = self.viewer.view(T, camera, _CENTRING_PX)
+            view = view or self.viewer.view(T, camera, _CENTRING_PX)
             if view is None:
                 break
             beside = field.compare(view, luma).extra
@@ -181,6 +196,7 @@ class PoseFitter:
             shift = np.linalg.solve(camera.K, np.append(field.centroid_px - pixels.mean(axis=0), 0.0))
             T = T.copy()
             T[:3, 3] += (T[2, :3] @ self.viewer.target.center_m + T[2, 3]) * shift
+            view = None
         return best
 
     def iterate(
@@ -193,12 +209,12 @@ class PoseFitter:
         schedule: Schedule,
         prior: RotationPrior | None = None,
     ) -> Fit:
-        """One round with the contour of a view rendered at the start pose."""
+        """One round with the contour of a view of the start, or of a pose that looks like it."""
         turned, information = np.zeros(3), np.zeros((3, 3))
         if prior is not None:
             turned = lie.so3_log(T_cam_target[:3, :3] @ prior.R_cam_target.T)
             information = prior.information
-        lines = contour_lines(view, T_cam_target, self._max_points)
+        lines = contour_lines(view, self._max_points)
         R, t, H, contour, mask_bias, _ = fit_contour(
             lines.points_m,
             lines.lines,
@@ -216,7 +232,20 @@ class PoseFitter:
             information,
             self.viewer.target.bounding_radius_m,
         )
-        return Fit(lie.transform(R, t), H, contour, lines.lines, mask_bias, view)
+        T = lie.transform(R, t)
+        shift_px, twist_px = self._displacement_px(view.T_cam_target, T, camera)
+        return Fit(T, H, contour, lines.lines, mask_bias, view, shift_px, twist_px)
+
+    def _displacement_px(
+        self, T_before: NDArray[np.float64], T_after: NDArray[np.float64], camera: Camera
+    ) -> tuple[NDArray[np.float64], float]:
+        """How the target's middle moves in the image (2,), and how far a part of it moves against that at most."""
+        target = self.viewer.target
+        before, after = (T[:3, :3] @ target.center_m + T[:3, 3] for T in (T_before, T_after))
+        angle = lie.angle_between(T_after[:3, :3], T_before[:3, :3])
+        radius_px = camera.K[0, 0] * target.bounding_radius_m / before[2]
+        twist_px = radius_px * (angle + abs(after[2] / before[2] - 1.0))
+        return camera.project(after) - camera.project(before), float(twist_px)
 
     def _rehearse(self) -> None:
         """Fit the target to a made-up mask, so that everything is compiled before the first frame comes."""

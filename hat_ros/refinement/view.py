@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -53,6 +53,7 @@ class View:
         camera: intrinsics of the crop.
         origin_px: (2,) image position of the crop's pixel (0, 0).
         scale: crop pixels per image pixel.
+        T_cam_target: (4, 4) pose that it shows.
         lit: (h, w) bool part of the silhouette that the sun shines on; None when no sun is known.
     """
 
@@ -61,7 +62,12 @@ class View:
     camera: Camera
     origin_px: NDArray[np.float64]
     scale: float
+    T_cam_target: NDArray[np.float64]
     lit: NDArray[np.bool_] | None = None
+
+    def shifted(self, shift_px: NDArray[np.float64]) -> View:
+        """The same silhouette (2,) image pixels further."""
+        return replace(self, origin_px=self.origin_px + shift_px)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +133,7 @@ class TargetViewer:
         K[:2] *= scale
         crop = Camera(K, int(width + width % 2), int(height + height % 2))
         mask, depth, lit = self._cast(T_cam_target, crop, to_sun_cam)
-        return View(mask, depth, crop, origin, scale, lit)
+        return View(mask, depth, crop, origin, scale, T_cam_target, lit)
 
     def bounds(self, T_cam_target: NDArray[np.float64], camera: Camera) -> NDArray[np.float64] | None:
         """Image box (x0, y0, x1, y1) around the target, None when it is not in front of the camera."""
@@ -225,13 +231,13 @@ class ContourLines:
     lines: NDArray[np.float64]
 
 
-def contour_lines(view: View, T_cam_target: NDArray[np.float64], max_points: int) -> ContourLines:
+def contour_lines(view: View, max_points: int) -> ContourLines:
     """Sample the contour of a view; where a sun is known, only what it shines on, since the rest cannot be seen."""
     table = contour_table(view.depth_m, view.mask, view.camera.K, max_points)
     if view.lit is not None:
         inner = np.rint(table[:, [COL_V, COL_U]] - table[:, [COL_NV, COL_NU]]).astype(np.intp)
         table = table[view.lit[inner[:, 0], inner[:, 1]]]
-    points = (table[:, :3] - T_cam_target[:3, 3]) @ T_cam_target[:3, :3]
+    points = (table[:, :3] - view.T_cam_target[:3, 3]) @ view.T_cam_target[:3, :3]
     # In rows, as the solver's other callers have them: another memory layout would be compiled once more.
     lines = np.ascontiguousarray(table[:, [COL_NU, COL_NV, COL_WEIGHT, COL_INSIDE, COL_OUTSIDE]])
     lines[:, 2:] /= view.scale

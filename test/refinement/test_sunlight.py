@@ -113,8 +113,8 @@ def test_what_faces_the_sun_is_lit_and_what_it_does_not_reach_is_no_contour(view
     assert share[0] > 0.9
     assert share[2] < 0.02
     assert share[0] > share[1] > share[2]
-    n_all = len(contour_lines(without, T, 300).points_m)
-    assert 0 < len(contour_lines(side, T, 300).points_m) < n_all
+    n_all = len(contour_lines(without, 300).points_m)
+    assert 0 < len(contour_lines(side, 300).points_m) < n_all
 
 
 def test_nothing_is_missed_in_the_shadow(viewer):
