@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 # Fewer known pixels of one side around a pixel tell nothing about that side.
 _MIN_PIXELS = 12
+# From a band this wide on, every second pixel of every second row is example enough of the colours around.
+_WIDE_BAND_PX = 4
 
 
 def refine_outline(rgb: NDArray[np.uint8], mask: NDArray[np.uint8], band_px: int, contrast: float) -> NDArray[np.uint8]:
@@ -31,8 +33,14 @@ def refine_outline(rgb: NDArray[np.uint8], mask: NDArray[np.uint8], band_px: int
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * band_px + 1, 2 * band_px + 1))
     inner = cv2.erode(mask, kernel, borderType=cv2.BORDER_REPLICATE)
     outer = cv2.dilate(mask, kernel, borderType=cv2.BORDER_REPLICATE)
-    inside, outside = _area_table(rgb, inner), _area_table(rgb, 1 - outer)
-    moved = _decide(rgb, mask, inner, outer, *inside, *outside, 2 * band_px + 2, np.float32(contrast * contrast))
+    open_xy = cv2.findNonZero(inner ^ outer)
+    if open_xy is None:
+        return mask
+    step = 2 if band_px >= _WIDE_BAND_PX else 1
+    examples = np.ascontiguousarray(rgb[::step, ::step])
+    inside, outside = _area_table(examples, inner[::step, ::step]), _area_table(examples, 1 - outer[::step, ::step])
+    reach, least = (2 * band_px + 2) // step, max(1, _MIN_PIXELS // step**2)
+    moved = _decide(rgb, mask, open_xy[:, 0], *inside, *outside, step, reach, least, np.float32(contrast * contrast))
     # A lone pixel that disagrees with most of its neighbours is noise.
     smooth = cv2.medianBlur(moved, 3)
     return np.where(inner == outer, mask, smooth)
@@ -40,6 +48,7 @@ def refine_outline(rgb: NDArray[np.uint8], mask: NDArray[np.uint8], band_px: int
 
 def _area_table(rgb: NDArray[np.uint8], mask: NDArray[np.uint8]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Summed-area tables (h + 1, w + 1) of a 0/1 mask and (h + 1, w + 1, 3) of the colours in it."""
+    mask = np.ascontiguousarray(mask)
     return cv2.integral(mask, sdepth=cv2.CV_32S), cv2.integral(cv2.copyTo(rgb, mask), sdepth=cv2.CV_32S)
 
 
@@ -50,32 +59,29 @@ def _box_sum(table, x0, y0, x1, y1):  # noqa: ANN001, ANN202 - compiled
 
 
 @njit(cache=True, nogil=True)
-def _mean_color(count, sums, x0, y0, x1, y1):  # noqa: ANN001, ANN202 - compiled
-    """Mean over the masked pixels of a box, given that there are some."""
-    n = _box_sum(count, x0, y0, x1, y1)
-    r = _box_sum(sums[:, :, 0], x0, y0, x1, y1)
-    g = _box_sum(sums[:, :, 1], x0, y0, x1, y1)
-    b = _box_sum(sums[:, :, 2], x0, y0, x1, y1)
-    return r / n, g / n, b / n
+def _color_sum(table, x0, y0, x1, y1, c):  # noqa: ANN001, ANN202 - compiled
+    """The same of one colour."""
+    return np.float32(np.int32(table[y1, x1, c] - table[y0, x1, c] - table[y1, x0, c] + table[y0, x0, c]))
 
 
 @njit(cache=True, nogil=True)
-def _decide(rgb, mask, inner, outer, n_inside, inside, n_outside, outside, reach, contrast_sq):  # noqa: ANN001, ANN202 - compiled
-    h, w = mask.shape
+def _decide(rgb, mask, open_xy, n_inside, inside, n_outside, outside, step, reach, least, contrast_sq):  # noqa: ANN001, ANN202 - compiled
     out = mask.copy()
-    for y in range(h):
-        for x in range(w):
-            if inner[y, x] == outer[y, x]:
-                continue
-            box = max(0, x - reach), max(0, y - reach), min(w, x + reach + 1), min(h, y + reach + 1)
-            if _box_sum(n_inside, *box) < _MIN_PIXELS or _box_sum(n_outside, *box) < _MIN_PIXELS:
-                continue
-            f0, f1, f2 = _mean_color(n_inside, inside, *box)
-            b0, b1, b2 = _mean_color(n_outside, outside, *box)
-            d0, d1, d2 = f0 - b0, f1 - b1, f2 - b2
-            norm_sq = d0 * d0 + d1 * d1 + d2 * d2
-            if norm_sq < contrast_sq:
-                continue
-            along = (rgb[y, x, 0] - b0) * d0 + (rgb[y, x, 1] - b1) * d1 + (rgb[y, x, 2] - b2) * d2
-            out[y, x] = 1 if 2 * along > norm_sq else 0
+    h, w = n_inside.shape[0] - 1, n_inside.shape[1] - 1
+    for i in range(len(open_xy)):
+        x, y = open_xy[i]
+        u, v = x // step, y // step
+        box = max(0, u - reach), max(0, v - reach), min(w, u + reach + 1), min(h, v + reach + 1)
+        n_f, n_b = _box_sum(n_inside, *box), _box_sum(n_outside, *box)
+        if n_f < least or n_b < least:
+            continue
+        along = norm_sq = np.float32(0.0)
+        for c in range(3):
+            background = _color_sum(outside, *box, c) / n_b
+            d = _color_sum(inside, *box, c) / n_f - background
+            norm_sq += d * d
+            along += (rgb[y, x, c] - background) * d
+        if norm_sq < contrast_sq:
+            continue
+        out[y, x] = 1 if 2 * along > norm_sq else 0
     return out

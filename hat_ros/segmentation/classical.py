@@ -86,8 +86,16 @@ class ClassicalSegmenter:
         """The predicted silhouette (H, W), None without a prior or when it is out of sight."""
         if prior is None or not np.isfinite(prior.pose_row).all():
             return None
-        camera = frame.camera
-        scale = min(1.0, 2 * self._config.work_side_px / max(camera.width, camera.height))
-        small = camera.crop(0, 0, camera.width, camera.height, scale)
-        mask = self._renderer.silhouette(prior.T_cam_target, small)
-        return enlarge(mask.view(np.uint8), (camera.width, camera.height)) if mask.any() else None
+        x0, y0, x1, y1 = self._renderer.pixel_bounds(prior.T_cam_target, frame.camera)
+        if x0 >= x1 or y0 >= y1:
+            return None
+        # Rendered about as fine as the region model works.
+        step = max(1, round(max(x1 - x0, y1 - y0) / self._config.work_side_px))
+        width, height = -(-(x1 - x0) // step) * step, -(-(y1 - y0) // step) * step
+        crop = frame.camera.crop(x0, y0, width, height, 1 / step)
+        part = self._renderer.silhouette(prior.T_cam_target, crop)
+        if not part.any():
+            return None
+        mask = np.zeros(frame.rgb.shape[:2], np.uint8)
+        mask[y0:y1, x0:x1] = enlarge(part.view(np.uint8), (width, height))[: y1 - y0, : x1 - x0]
+        return mask

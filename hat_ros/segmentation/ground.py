@@ -19,7 +19,7 @@ from hat_ros.segmentation.masks import Mask, Window, overlap
 
 _SIDE_PX = 320  # longer side of the frames remembered
 _MAX_POINTS = 80
-_FEW_POINTS = 40  # followed on; with fewer, all are chosen anew
+_FEW_POINTS = 0.5  # share of those chosen that is followed on; with fewer, all are chosen anew
 _MIN_POINTS = 12
 _POINT_QUALITY = 0.005
 _POINT_SPACING_PX = 10
@@ -92,6 +92,7 @@ class GroundMemory:
         """Forget earlier frames."""
         self._frames: list[_Remembered] = []
         self._points = _NO_POINTS
+        self._n_chosen = 0  # points to start with
         self._grey: NDArray[np.uint8] | None = None
         self._scale = (1.0, 1.0)
 
@@ -121,8 +122,9 @@ class GroundMemory:
             inside = (x >= 0) & (y >= 0) & (x < free.shape[1]) & (y < free.shape[0])
             points = points[inside]
             points = points[free[y[inside], x[inside]] > 0]
-        if len(points) < _FEW_POINTS:
+        if len(points) <= max(_MIN_POINTS, _FEW_POINTS * self._n_chosen):
             points = cv2.goodFeaturesToTrack(self._grey, _MAX_POINTS, _POINT_QUALITY, _POINT_SPACING_PX, mask=free)
+            self._n_chosen = 0 if points is None else len(points)
         self._points = _NO_POINTS
         if points is None or len(points) < _MIN_POINTS:
             return None
