@@ -27,8 +27,12 @@ _CORNER_QUALITY = 0.004
 # Points keep apart by this share of what an even spread over the region would give: the strongest corners of a scene
 # crowd together, and a crowd says little about depth.
 _EVENNESS = 0.5
-# New corners are looked for once this share of the slots is free.
+# New corners are looked for once this share of the slots is free, ...
 _WORTHWHILE_SHARE = 0.1
+# ... in every second frame, or when so much of what was followed is lost: a region that has fewer corners than there
+# are slots does not have more of them in every frame.
+_LOOK_PERIOD = 2
+_LOST_SHARE = 0.25
 
 
 class PointTracks:
@@ -50,6 +54,8 @@ class PointTracks:
         self.alive = np.zeros(n_slots, dtype=bool)
         self.track_id = np.full(n_slots, -1)
         self._next_id = 0
+        self._n_followed = 0  # after the last look for corners
+        self._since_look = 0
         self._image: Image | None = None
 
     def advance(self, image: Image, region: Image, xy_guess: Float) -> None:
@@ -73,7 +79,10 @@ class PointTracks:
         """Fill free slots with new corners; returns the slots filled."""
         self._image = image
         free = np.flatnonzero(~self.alive)
-        if len(free) < _WORTHWHILE_SHARE * len(self.alive):
+        self._since_look += 1
+        n_alive = len(self.alive) - len(free)
+        lost = n_alive <= (1.0 - _LOST_SHARE) * self._n_followed
+        if len(free) < _WORTHWHILE_SHARE * len(self.alive) or not (lost or self._since_look >= _LOOK_PERIOD):
             return free[:0]
         even_px = np.sqrt(np.count_nonzero(region) / len(self.alive))
         spacing_px = max(self._spacing_px, _EVENNESS * float(even_px))
@@ -83,6 +92,7 @@ class PointTracks:
         self.alive[slots] = True
         self.track_id[slots] = self._next_id + np.arange(len(slots))
         self._next_id += len(slots)
+        self._n_followed, self._since_look = n_alive + len(slots), 0
         return slots
 
 
