@@ -16,7 +16,7 @@ Image = NDArray[np.uint8]
 
 _WINDOW_PX = 17
 _LEVELS = 3
-_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
+_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.03)
 _MIN_EIGENVALUE = 1e-4
 # A track followed back must end this close to its start.
 _BACKWARD_TOLERANCE_PX = 0.4
