@@ -21,8 +21,8 @@ from hat_ros.refinement.contour import (
     COL_WEIGHT,
     contour_table,
 )
-from hat_ros.refinement.outline import Rays, grid_rays, pixel_rays, place_pixels, spread_grid
 from hat_ros.render.embree import RayCaster
+from hat_ros.render.outline import Hits, Rays, cast_outlined
 from hat_ros.target import Target
 from hat_ros.types import Camera
 
@@ -165,22 +165,15 @@ class TargetViewer:
         to_ray = np.ascontiguousarray((R.T @ np.linalg.inv(crop.K)).T)  # rays in the target frame: affine in the pixel
         origin = -t @ R
         to_sun = None if to_sun_cam is None else (to_sun_cam / np.linalg.norm(to_sun_cam) @ R).astype(np.float32)
-        rays = grid_rays(crop.width, crop.height, to_ray, origin)
-        hits = self._caster.trace(*rays)
-        mask, depth, x, y = spread_grid(hits["primID"], hits["tfar"], crop.width, crop.height)
+        seen = cast_outlined(self._caster.trace, crop.width, crop.height, to_ray, origin)
         lit = None
         if to_sun is not None:
-            sunlit = self._sunlit_hits(hits, rays, to_sun).reshape(crop.height // 2, crop.width // 2)
+            sunlit = self._sunlit_hits(*seen.grid, to_sun).reshape(crop.height // 2, crop.width // 2)
             lit = np.repeat(np.repeat(sunlit, 2, axis=0), 2, axis=1)
-        if len(x):
-            rays = pixel_rays(x, y, to_ray, origin)
-            hits = self._caster.trace(*rays)
-            place_pixels(mask, depth, x, y, hits["primID"], hits["tfar"])
-            if lit is not None:
-                lit[y, x] = self._sunlit_hits(hits, rays, to_sun)
-        return mask, depth, lit
+            lit[seen.y, seen.x] = self._sunlit_hits(*seen.scattered, to_sun)
+        return seen.mask, seen.depth_m, lit
 
-    def _sunlit_hits(self, hits: dict[str, NDArray], rays: Rays, to_sun: NDArray[np.float32]) -> NDArray[np.bool_]:
+    def _sunlit_hits(self, rays: Rays, hits: Hits, to_sun: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Which of the rays (N,) hit something that the sun shines on."""
         at = np.flatnonzero(hits["primID"] >= 0)
         origins, directions = rays
@@ -214,6 +207,16 @@ class TargetViewer:
         lit = lit[~self._caster.occluded(start, np.broadcast_to(to_sun, start.shape))]
         out = np.zeros(len(points_m), np.float32)
         out[lit] = cosine[lit]
+        return out
+
+    def sunlit_surfels(self, seen: Surfels, to_suns: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Cosine of the incidence (S, M) of several suns (S, 3), unit, target frame, on what is seen; 0 in shadow."""
+        out = np.maximum(to_suns @ seen.normals.T, np.float32(0))
+        sun, at = np.nonzero(out > _GRAZING)
+        start = (seen.points_m + self._shadow_start_m * seen.normals)[at]
+        dark = self._caster.occluded(start, to_suns[sun])
+        out[sun[dark], at[dark]] = 0
+        out[out <= _GRAZING] = 0
         return out
 
 

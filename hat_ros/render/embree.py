@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from hat_ros.render import Rendering
+from hat_ros.render.outline import cast_outlined
 from hat_ros.target import Target
 from hat_ros.types import Camera
 
@@ -103,6 +104,21 @@ class EmbreeRenderer:
         if x0 < x1 and y0 < y1:
             _, hits = self._cast(T_cam_target, camera, (x0, y0, x1, y1))
             mask[y0:y1, x0:x1] = (hits["primID"] >= 0).reshape(y1 - y0, x1 - x0)
+        return mask
+
+    def outlined(self, T_cam_target: NDArray[np.float64], camera: Camera) -> NDArray[np.bool_]:
+        """The mask like :meth:`silhouette` in half the time; specks may be lost."""
+        mask = np.zeros((camera.height, camera.width), np.bool_)
+        x0, y0, x1, y1 = self.pixel_bounds(T_cam_target, camera)
+        if x0 >= x1 or y0 >= y1:
+            return mask
+        R, t = T_cam_target[:3, :3], T_cam_target[:3, 3]
+        K = camera.K.copy()
+        K[:2, 2] -= x0, y0
+        to_ray, origin = np.ascontiguousarray((R.T @ np.linalg.inv(K)).T), -t @ R
+        width, height = x1 - x0 + (x1 - x0) % 2, y1 - y0 + (y1 - y0) % 2
+        part = cast_outlined(self.caster.trace, width, height, to_ray, origin).mask
+        mask[y0:y1, x0:x1] = part[: y1 - y0, : x1 - x0]
         return mask
 
     def _cast(

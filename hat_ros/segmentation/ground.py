@@ -96,9 +96,14 @@ class GroundMemory:
         self._grey: NDArray[np.uint8] | None = None
         self._scale = (1.0, 1.0)
 
-    def push(self, rgb: NDArray[np.uint8], mask_before: Mask | None) -> None:
-        """Add the newest frame, (H, W, 3) uint8, and say where the target was in the one before, if that is known."""
-        small = Window.whole(rgb, _SIDE_PX).rgb
+    def push(self, rgb: NDArray[np.uint8], mask_before: Mask | None) -> Window:
+        """Add the newest frame, (H, W, 3) uint8, and say where the target was in the one before, if that is known.
+
+        Returns:
+            The frame as it is remembered.
+        """
+        whole = Window.whole(rgb, _SIDE_PX)
+        small = whole.rgb
         grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
         if self._grey is not None and self._grey.shape == grey.shape:
             if mask_before is not None:
@@ -113,6 +118,7 @@ class GroundMemory:
         self._frames.append(_Remembered(small, np.ones(grey.shape, np.uint8), np.eye(3)))
         self._grey = grey
         self._scale = (small.shape[1] / rgb.shape[1], small.shape[0] / rgb.shape[0])
+        return whole
 
     def _follow(self, grey: NDArray[np.uint8]) -> NDArray[np.float64] | None:
         """(3, 3) homography that most point tracks follow into the next frame outside the target; None without one."""

@@ -109,12 +109,13 @@ class Window:
     rgb: NDArray[np.uint8]
 
     @classmethod
-    def whole(cls, rgb: NDArray[np.uint8], side_px: int) -> Window:
-        """The whole image, its longer side reduced to at most ``side_px``."""
+    def whole(cls, rgb: NDArray[np.uint8], side_px: int, reduced: Window | None = None) -> Window:
+        """The whole image, its longer side reduced to at most ``side_px``; faster from a larger such window."""
         h, w = rgb.shape[:2]
         scale = min(1.0, side_px / max(h, w))
         size = (max(1, round(w * scale)), max(1, round(h * scale)))
-        return cls(0, 0, w, h, scale, _reduced(rgb, size))
+        source = rgb if reduced is None or reduced.scale < scale else reduced.rgb
+        return cls(0, 0, w, h, scale, _reduced(source, size))
 
     @classmethod
     def around(

@@ -74,8 +74,8 @@ class Search:
 
     def push(self, rgb: NDArray[np.uint8], mask_before: Mask | None = None) -> None:
         """Show it the newest image, (H, W, 3) uint8, and the previous one's mask; to be called once per frame."""
-        self.ground.push(rgb, mask_before)
-        self._window = Window.whole(rgb, self._config.cold_side_px)
+        remembered = self.ground.push(rgb, mask_before)
+        self._window = Window.whole(rgb, self._config.cold_side_px, remembered)
         self._motion.push(self._window.rgb)
 
     def judge(self, mask: Mask) -> tuple[float, float]:

@@ -153,3 +153,23 @@ def test_pyrender_agrees_or_says_what_is_missing():
     assert np.median(np.abs(view.depth_m - traced.depth_m)[both]) < 0.01
     assert np.abs(view.rgb[both].astype(float) - traced.rgb[both]).mean() < 20
     renderer.close()
+
+
+@pytest.mark.parametrize("t", [(0, 0, 4), (0.3, -0.2, 2.5), (1.3, 0.9, 3), (0, 0, 60)])
+def test_an_outlined_silhouette_is_the_silhouette_but_for_specks(t):
+    body = trimesh.util.concatenate(
+        [
+            trimesh.creation.box((1, 0.7, 0.6)),
+            trimesh.creation.box((0.6, 0.05, 0.4), lie.transform(np.eye(3), [0.8, 0, 0])),
+        ]
+    )
+    renderer = create_renderer("embree", scene_target(body))
+    for rotvec in ((0, 0, 0), (0.4, -0.8, 0.3), (1.5, 0.2, 2.0)):
+        whole, outlined = (cast(at(t, rotvec), CAMERA) for cast in (renderer.silhouette, renderer.outlined))
+        assert outlined.shape == whole.shape and outlined.dtype == np.bool_
+        assert not (outlined & ~whole).any()
+        assert np.count_nonzero(whole & ~outlined) <= 0.02 * np.count_nonzero(whole)
+
+
+def test_nothing_is_outlined_behind_the_camera():
+    assert not create_renderer("embree", scene_target(trimesh.creation.box())).outlined(at((0, 0, -4)), CAMERA).any()
