@@ -7,6 +7,7 @@ import numpy as np
 
 from hat_ros.config import ClassicalConfig
 from hat_ros.segmentation import sky
+from hat_ros.segmentation.dim import with_dim_parts
 from hat_ros.segmentation.masks import Mask, border_contact, enlarge, shrink, touches_border
 from hat_ros.segmentation.search import CUT_SURCHARGE
 from hat_ros.segmentation.shape import SilhouetteBank
@@ -19,6 +20,10 @@ _SAME_SHARE = 0.6  # of a region lies where the target was
 _MAX_GROWTH = 1.6  # of the target's area from one frame to the next
 _MIN_LIT_SHAPE = 0.5  # shape overlap of the lit part of a target
 _MAX_CONTACT = 0.4  # share of its outline that the image border may cut off a target
+# With less than this share of a body lit, the gaps between its parts may be shadow; with less than the other, what is
+# lit has no shape of its own.
+_SCATTERED_SHARE = 0.65
+_SHAPELESS_SHARE = 0.35
 _SCATTERED_GAIN = 0.1  # shape overlap that bridging the gaps between lit parts must bring
 
 
@@ -49,8 +54,9 @@ class LitBody:
             main = self._choose(regions, rivals, before, silhouette)
             if main is None:
                 return None
-        lit = sky.join_parts(regions, main)
-        body = self._complete(measured, lit)
+        bright = sky.join_parts(regions, main)
+        lit = with_dim_parts(measured, bright)
+        body = self._complete(lit, sky.lit_share(bright))
         if silhouette is not None and _explains(silhouette, lit, body):
             return lit | _shadowed(silhouette, lit)
         return body
@@ -79,16 +85,25 @@ class LitBody:
         cut = [i for i in rivals if shape[i] >= required and border_contact(regions[i]) <= _MAX_CONTACT]
         return max((i for i in cut if i not in whole), key=lambda i: shape[i], default=best)
 
-    def _complete(self, measured: sky.Sky, lit: Mask) -> Mask:
-        """The body of which ``lit`` are the lit parts: ``lit`` itself unless it is scattered over a CAD silhouette."""
-        if not sky.is_scattered(lit):
+    def _complete(self, lit: Mask, lit_share: float) -> Mask:
+        """The body of which ``lit`` are the lit parts: ``lit`` itself, or with its gaps bridged.
+
+        Bridging shows a body in shadow, but fills the sky between wings and hull as well. So what it makes must be
+        a shape that the CAD model can have, unless what is lit has none at all.
+        """
+        if lit_share >= _SCATTERED_SHARE:
             return lit
-        options = sky.bridge_gaps(measured, lit, self._config.work_side_px)
+        box, options = sky.bridge_gaps(lit, self._config.work_side_px)
         shapes = [self._bank.overlap(option) for option in options]
         best = int(np.argmax(shapes))
-        if shapes[best] < shapes[0] + _SCATTERED_GAIN:
+        required = shapes[0] + _SCATTERED_GAIN
+        if lit_share >= _SHAPELESS_SHARE:
+            required = max(required, self._config.min_shape_overlap)
+        if shapes[best] < required:
             return lit
-        return lit | enlarge(options[best].astype(np.uint8), (lit.shape[1], lit.shape[0]))
+        body = lit.copy()
+        body[box] |= enlarge(options[best].astype(np.uint8), (body[box].shape[1], body[box].shape[0]))
+        return body
 
 
 def _explains(silhouette: Mask, lit: Mask, body: Mask) -> bool:

@@ -1,6 +1,7 @@
 """A lit target before a black sky: threshold, outline at the local half maximum, stars and hot pixels left out.
 
-Parts that are as black as the sky cannot be seen and are not in the mask, unless a trusted silhouette says so.
+Parts too dim for single pixels are found by :mod:`hat_ros.segmentation.dim`. Parts as black as the sky cannot be seen
+and are not in the mask, unless a trusted silhouette says so.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from hat_ros.segmentation.masks import fill_holes, touches_border
 
 # A sky pixel is at most this bright (8-bit, any channel); black level and noise of real cameras stay below.
-_SKY_MAX = 48
+SKY_MAX = 48
 _RING_PX = 8  # width of the image border that is looked at for the sky
 _NOISE_SIGMAS = 5.0
 _MIN_STEP = 1.5  # smallest excess over the sky that counts, for noise-free images
@@ -24,8 +25,9 @@ _EDGE_SHARE = 0.4
 _STAR_AREA_PX = 40  # a blob below this, away from the target, is a star
 _SPECK_AREA_PX = 6
 _HOLE_SHARE = 0.1  # a hole up to this share of the area is a dark detail; larger ones are gaps between parts
-_WHOLE_SHARE = 0.35  # of a body's area is lit, or else it counts as scattered: more has a shape of its own
-_COARSE_PX = 9  # side of the mean that finds what is barely brighter than the sky
+# Gaps bridged, and room left around the lit parts, as shares of their longer side.
+_BRIDGED_SHARES = (0.02, 0.04, 0.08, 0.16)
+_BRIDGED_MARGIN = 0.1
 _FAINT_STEPS = 4  # below this many thresholds of contrast a single pixel says nothing
 _MAX_REGIONS = 8  # looked at; a field of stars may hold thousands
 _HOT_EXCESS = 30  # a hot pixel is this much brighter than all its neighbours
@@ -81,7 +83,7 @@ def dark_border_share(rgb: NDArray[np.uint8]) -> float:
 def _dark_border(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Which pixels of the border are black in every channel (a dark sea is blue)."""
     brightest = np.concatenate([rgb[strip].reshape(-1, 3) for strip in _border(rgb.shape)]).max(axis=1)
-    return brightest < _SKY_MAX
+    return brightest < SKY_MAX
 
 
 def _border(shape: tuple[int, ...]) -> tuple[tuple[slice, slice], ...]:
@@ -156,43 +158,39 @@ def join_parts(regions: list[NDArray[np.uint8]], main: int) -> NDArray[np.uint8]
     return out
 
 
-def is_scattered(lit: NDArray[np.uint8]) -> bool:
-    """Whether an (H, W) 0/1 mask is a loose collection of pieces rather than one body."""
+def lit_share(lit: NDArray[np.uint8]) -> float:
+    """How much of a body is lit, 0 to 1: share of an (H, W) 0/1 mask in what it covers with its gaps joined."""
     x, y, w, h = cv2.boundingRect(lit)
     scale = min(1.0, 64 / max(w, h))
     size = (max(1, round(w * scale)), max(1, round(h * scale)))
     share = cv2.resize(lit[y : y + h, x : x + w] * 255, size, interpolation=cv2.INTER_AREA)
     joined = cv2.morphologyEx(share, cv2.MORPH_CLOSE, np.ones((11, 11), np.uint8))
-    return float(share.mean()) < _WHOLE_SHARE * float(joined.mean())
+    return float(share.mean()) / float(joined.mean())
 
 
-def bridge_gaps(measured: Sky, lit: NDArray[np.uint8], side_px: int) -> list[NDArray[np.bool_]]:
+def bridge_gaps(lit: NDArray[np.uint8], side_px: int) -> tuple[tuple[slice, slice], list[NDArray[np.bool_]]]:
     """What a body of which only scattered parts are lit may look like: gaps of growing width bridged.
 
     Args:
-        measured: the sky of this image.
         lit: (H, W) uint8 of 0 and 1, the lit parts.
         side_px: longer side of the reduced masks returned.
 
     Returns:
-        Reduced (h, w) masks; the first has no gap bridged.
+        The part of the image that holds the lit parts, and reduced (h, w) masks of it; the first has no gap bridged.
     """
     x, y, w, h = cv2.boundingRect(lit)
-    box = np.s_[y : y + h, x : x + w]
-    coarse = cv2.boxFilter(measured.luma[box], cv2.CV_32F, (_COARSE_PX, _COARSE_PX))
-    # A mean over n x n instead of 3 x 3 pixels has 3 / n of the noise.
-    faint = coarse > measured.level + (measured.threshold - measured.level) * 3 / _COARSE_PX
-    faint = cv2.erode(faint.astype(np.uint8), np.ones((_COARSE_PX, _COARSE_PX), np.uint8))
-    either = lit.copy()
-    either[box] |= faint
-    scale = min(1.0, side_px / max(lit.shape))
-    size = (max(1, round(lit.shape[1] * scale)), max(1, round(lit.shape[0] * scale)))
-    small = (cv2.resize(either * 255, size, interpolation=cv2.INTER_AREA) > 63).astype(np.uint8)
-    out = [cv2.resize(lit * 255, size, interpolation=cv2.INTER_AREA) > 127]
-    for share in (0.02, 0.04, 0.08, 0.16):
-        radius = max(1, round(share * max(w, h) * scale))
+    margin = round(_BRIDGED_MARGIN * max(w, h)) + 1
+    box = np.s_[max(0, y - margin) : y + h + margin, max(0, x - margin) : x + w + margin]
+    part = lit[box] * 255
+    scale = min(1.0, side_px / max(part.shape))
+    size = (max(1, round(part.shape[1] * scale)), max(1, round(part.shape[0] * scale)))
+    share = cv2.resize(part, size, interpolation=cv2.INTER_AREA)
+    small = (share > 63).astype(np.uint8)
+    out = [share > 127]
+    for gap in _BRIDGED_SHARES:
+        radius = max(1, round(gap * max(w, h) * scale))
         padded = cv2.copyMakeBorder(small, radius, radius, radius, radius, cv2.BORDER_CONSTANT, value=0)
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
         closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, kernel)[radius:-radius, radius:-radius]
         out.append(fill_holes(np.ascontiguousarray(closed), 1.0).astype(bool))
-    return out
+    return box, out

@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 
-from hat_ros.segmentation.sky import is_scattered
+from hat_ros.segmentation.sky import bridge_gaps, lit_share
 
 
 def _discs(radius_px):
@@ -12,7 +12,28 @@ def _discs(radius_px):
     return mask
 
 
-def test_specks_are_scattered_and_large_parts_with_gaps_between_them_are_not():
-    """Bridging the gaps between specks shows the body; between wings and hull it fills what is sky."""
-    assert is_scattered(_discs(2))
-    assert not is_scattered(_discs(6))
+def test_the_lit_share_of_a_body_grows_with_its_parts():
+    shares = [lit_share(_discs(radius)) for radius in (2, 4, 6)]
+    assert shares == sorted(shares)
+    assert shares[0] < 0.1 and shares[-1] > 0.4
+    whole = np.zeros((240, 240), np.uint8)
+    whole[80:120, 90:200] = 1
+    assert lit_share(whole) > 0.99
+
+
+def test_bridged_gaps_do_not_depend_on_the_image_around_the_body():
+    """A small body in a large image is seen as finely as one that fills it."""
+    small = _discs(5)
+    large = np.zeros((960, 1280), np.uint8)
+    large[500:740, 700:940] = small
+    box, options = bridge_gaps(small, 96)
+    box_in_large, options_in_large = bridge_gaps(large, 96)
+    np.testing.assert_array_equal(large[box_in_large], small[box])
+    for one, other in zip(options, options_in_large, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_wider_bridges_cover_what_narrower_ones_do():
+    _, options = bridge_gaps(_discs(5), 96)
+    areas = [np.count_nonzero(option) for option in options]
+    assert areas == sorted(areas) and areas[-1] > 1.5 * areas[0]
