@@ -15,7 +15,16 @@ from numba import njit
 from numpy.typing import NDArray
 
 from hat_ros import lie
-from hat_ros.hypotheses.bank import ViewBank, image_moments, mask_moments, polar_grid, ring_weights
+from hat_ros.hypotheses.bank import (
+    MAX_RADIUS,
+    PolarSampler,
+    ViewBank,
+    border_grid,
+    image_moments,
+    mask_moments,
+    polar_grid,
+    ring_weights,
+)
 from hat_ros.types import Camera
 
 # What silhouette without mask costs, against mask without silhouette = 1. A part that lies in shadow or outside the
@@ -135,16 +144,17 @@ def _best_matches(
     center_m: NDArray[np.float64],
 ) -> ShapeMatches:
     """The best of all scores (placements, views, angles) that are distinct."""
-    flat = score.ravel()
-    for n_sorted in (min(flat.size, count) for count in _SORTED_COUNTS):
-        order = np.argpartition(-flat, n_sorted - 1)[:n_sorted]
-        order = order[np.lexsort((order, -flat[order]))]
-        placement, view, angle = np.unravel_index(order, score.shape)
+    peaks = _peaks(score)
+    best = score.ravel()[peaks]
+    for n_sorted in (min(len(peaks), count) for count in _SORTED_COUNTS):
+        order = np.argpartition(-best, n_sorted - 1)[:n_sorted]
+        order = order[np.lexsort((order, -best[order]))]
+        placement, view, angle = np.unravel_index(peaks[order], score.shape)
         T = _poses(bank, placements, placement, view, angle * (2.0 * np.pi / bank.n_angles), camera, center_m)
         keep = distinct(T[:, :3, :3], n_best, np.radians(separation_deg))
         if len(keep) == n_best:
             break
-    return ShapeMatches(T[keep], view[keep], flat[order][keep].astype(np.float64))
+    return ShapeMatches(T[keep], view[keep], best[order][keep].astype(np.float64))
 
 
 def distinct(R: NDArray[np.float64], n_best: int, separation_rad: float) -> NDArray[np.intp]:
@@ -164,17 +174,45 @@ def distinct(R: NDArray[np.float64], n_best: int, separation_rad: float) -> NDAr
 
 def _scores(bank: ViewBank, mask: NDArray[np.bool_], placements: list[Placement]) -> NDArray[np.float32]:
     """Tversky overlap (placements, views, angles) between mask and view, over what lies inside the image."""
-    image = mask.astype(np.float32)
-    n_angles = bank.n_angles
-    grids = np.stack([polar_grid(image, p.center_px, p.gyration_px, n_angles) for p in placements])
-    inside = np.stack([polar_grid(np.ones_like(image), p.center_px, p.gyration_px, n_angles) for p in placements])
+    sampler, n_angles = PolarSampler(mask.astype(np.float32)), bank.n_angles
+    grids = np.stack([sampler.grid(p.center_px, p.gyration_px, n_angles) for p in placements])
     overlap = _correlate(bank, grids)
-    full = inside.min() > 0  # nothing of any grid lies outside the image
-    silhouette = bank.area[None, :, None] if full else _correlate(bank, inside)
     # Both grids carry the root of the sample's area; that of a mask against ones carries it once more.
     mask_area = (grids @ ring_weights()).sum(axis=1)[:, None, None]
-    union = overlap + (mask_area - overlap) + MISSING_WEIGHT * (silhouette - overlap)
-    return overlap / np.maximum(union, 1e-6)
+    silhouette = np.broadcast_to(bank.area[None, :, None], overlap.shape)
+    beyond = [i for i, p in enumerate(placements) if not _is_inside(p, mask.shape)]
+    if beyond:
+        cut = (placements[i] for i in beyond)
+        inside = np.stack([border_grid(mask.shape, p.center_px, p.gyration_px, n_angles) for p in cut])
+        silhouette = silhouette.copy()
+        silhouette[beyond] = _correlate(bank, inside)
+    union = silhouette - overlap
+    union *= np.float32(MISSING_WEIGHT)
+    union += mask_area  # which is overlap + (mask_area - overlap)
+    overlap /= np.maximum(union, np.float32(1e-6), out=union)
+    return overlap
+
+
+def _is_inside(placement: Placement, shape: tuple[int, ...]) -> bool:
+    """Whether the whole polar grid about a placement lies inside an image (H, W)."""
+    reach = MAX_RADIUS * placement.gyration_px
+    low, high = placement.center_px - reach, placement.center_px + reach
+    return bool(low.min() >= 0 and high[0] <= shape[1] - 1 and high[1] <= shape[0] - 1)
+
+
+@njit(cache=True, nogil=True)
+def _peaks(score: NDArray[np.float32]) -> NDArray[np.intp]:
+    """Flat indices of the scores (P, V, angles) that no neighbouring angle of the same view exceeds."""
+    n_placements, n_views, n_angles = score.shape
+    out, count = np.empty(score.size, np.intp), 0
+    for p in range(n_placements):
+        for v in range(n_views):
+            for a in range(n_angles):
+                s = score[p, v, a]
+                if s >= score[p, v, a - 1] and s >= score[p, v, a + 1 - n_angles]:
+                    out[count] = (p * n_views + v) * n_angles + a
+                    count += 1
+    return out[:count]
 
 
 def _correlate(bank: ViewBank, grids: NDArray[np.float32]) -> NDArray[np.float32]:

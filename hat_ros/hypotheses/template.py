@@ -58,8 +58,6 @@ _SELECTION_TOLERANCE_PX = 1.0
 _POOR_SCORE = -6.0
 # Score short of the best at which no sunlight helps.
 _LIGHT_MATTERS = 14.0
-# The sun is fitted to so many more matches of brightness than are refined.
-_MATCHED_PER_REFINED = 2
 # With a healthy prior among the starts, fewer matches: they are there to contradict it, not to find the target.
 _TRACKED_DIVISOR = 2
 # A lead in log-likelihood that ends the search; without one, so many times the usual shape matches are tried.
@@ -138,7 +136,7 @@ class TemplateHypotheses:
         leader = max(scored, key=lambda pair: pair[1], default=None)
         if scorer.dark_around and (leader is None or not self._confirms(leader[0], prior)):
             # What lies in shadow is missing from the mask: compare what is bright.
-            lit = self._align(self._sunlit(starts, frame, scorer) + self._coarse_lit(frame, scorer), frame, scorer)
+            lit = self._align(self._sunlit(starts + self._coarse_lit(frame, scorer), frame, scorer), frame, scorer)
             scored += self._finish(lit, frame, scorer)
         elif not self._is_clear(scored, prior):
             further = self._coarse(placements, frame, field, _MORE_COARSE * self._options.n_coarse, n_coarse)
@@ -173,24 +171,14 @@ class TemplateHypotheses:
         return [Start(T) for T in self._pulled(self._bank, further, frame, field)]
 
     def _coarse_lit(self, frame: Frame, scorer: Scorer) -> list[Start]:
-        """Matches of brightness, the best explained by sunlight first."""
-        bank, options = self._lit_bank, self._options
-        light = scorer.light()
+        """The best matches of brightness."""
+        light, options = scorer.light(), self._options
         if light is None:
             return []
         matches = match_light(
-            bank, light, frame.camera, options.n_coarse_lit, options.separation_deg, self._target.center_m
+            self._lit_bank, light, frame.camera, options.n_coarse_lit, options.separation_deg, self._target.center_m
         )
-        mask = scorer.field.mask
-        at_a_glance = np.array([self._sun.glance(T, frame, mask) for T in matches.T_cam_target])
-        promising = np.argsort(at_a_glance, kind="stable")[: _MATCHED_PER_REFINED * options.n_refined_lit]
-        found = []
-        for T in matches.T_cam_target[promising]:
-            sunlight = self._sun.match(T, frame, mask)
-            if sunlight is not None:
-                found.append((sunlight.distance, Start(T, sunlight.to_sun_cam)))
-        found.sort(key=lambda pair: pair[0])
-        return [start for _, start in found[: options.n_refined_lit]]
+        return [Start(T) for T in matches.T_cam_target]
 
     def _sunlit(self, starts: list[Start], frame: Frame, scorer: Scorer) -> list[Start]:
         """The same starts in the sunlight that suits them."""

@@ -29,10 +29,6 @@ _MAX_BEHIND = 0.75
 # Pixels of that first trial, which leaves out cast shadows; the best directions are tried with them.
 _TRIAL_PIXELS = 400
 _N_SHADOWED = 3
-# The same for a glance.
-_GLANCE_SIDE_PX = 24
-_N_GLANCE_SUNS = 60
-_GLANCE_PIXELS = 150
 # Light that reaches a shadowed face, as a share of the sun's; exponent of the image's encoding.
 _AMBIENT = 0.003
 _GAMMA = 1.0 / 2.2
@@ -75,8 +71,6 @@ class SunMatcher:
         self._viewer = viewer
         suns = _even_directions(_N_SUNS)
         self._suns = suns[suns[:, 2] < _MAX_BEHIND].astype(np.float32)
-        few = _even_directions(_N_GLANCE_SUNS)
-        self._few_suns = few[few[:, 2] < _MAX_BEHIND].astype(np.float32)
         self._encoded = brightness(np.linspace(0.0, 1.0, 257, dtype=np.float32))
 
     def match(self, T_cam_target: NDArray[np.float64], frame: Frame, mask: NDArray[np.bool_]) -> Sunlight | None:
@@ -92,24 +86,11 @@ class SunMatcher:
             return None
         R, seen, albedo = T_cam_target[:3, :3], scene.seen, scene.seen.rgb.astype(np.float32)
         trial = self._trial(scene, R, self._suns, _TRIAL_PIXELS)
-        best: Sunlight | None = None
-        for index in np.argsort(trial, kind="stable")[:_N_SHADOWED]:
-            to_sun = self._suns[index]
-            cosine = self._viewer.sunlit(seen.points_m, seen.face_id, seen.directions, to_sun @ R.astype(np.float32))
-            distance = _distance(cosine, albedo, scene.observed, scene.beside, self._encoded)
-            if best is None or distance < best.distance:
-                best = Sunlight(float(distance), to_sun.astype(np.float64))
-        return best
-
-    def glance(self, T_cam_target: NDArray[np.float64], frame: Frame, mask: NDArray[np.bool_]) -> float:
-        """Distance as :meth:`match` would give it, roughly, in a fifth of the time: few pixels and suns, no shadows.
-
-        1 when the target is out of view.
-        """
-        scene = self._scene(T_cam_target, frame, mask, _GLANCE_SIDE_PX)
-        if scene is None:
-            return 1.0
-        return float(self._trial(scene, T_cam_target[:3, :3], self._few_suns, _GLANCE_PIXELS).min())
+        promising = self._suns[np.argsort(trial, kind="stable")[:_N_SHADOWED]]
+        cosine = self._viewer.sunlit_surfels(seen, promising @ R.astype(np.float32))
+        distance = [_distance(c, albedo, scene.observed, scene.beside, self._encoded) for c in cosine]
+        best = int(np.argmin(distance))
+        return Sunlight(float(distance[best]), promising[best].astype(np.float64))
 
     def _trial(self, scene: _Scene, R_cam_target: NDArray[np.float64], suns: Float32, max_pixels: int) -> NDArray:
         """Distance (S,) under each sun, without cast shadows, over at most about so many pixels in grey."""
@@ -150,10 +131,10 @@ class SunMatcher:
         bounds = self._viewer.bounds(T_cam_target, camera)
         if bounds is None:
             return None
-        rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-        x0, y0 = max(min(int(bounds[0]), cols[0]), 0), max(min(int(bounds[1]), rows[0]), 0)
-        x1 = min(max(int(np.ceil(bounds[2])), cols[-1]) + 1, camera.width)
-        y1 = min(max(int(np.ceil(bounds[3])), rows[-1]) + 1, camera.height)
+        left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
+        x0, y0 = max(min(int(bounds[0]), left), 0), max(min(int(bounds[1]), top), 0)
+        x1 = min(max(int(np.ceil(bounds[2])) + 1, left + width), camera.width)
+        y1 = min(max(int(np.ceil(bounds[3])) + 1, top + height), camera.height)
         if x1 - x0 < 2 or y1 - y0 < 2:
             return None
         scale = min(1.0, side_px / max(x1 - x0, y1 - y0))
@@ -183,18 +164,58 @@ def _even_directions(count: int) -> NDArray[np.float64]:
 @njit(cache=True, nogil=True)
 def _trial(
     normals: Float32, albedo: Float32, observed: Float32, beside: float, suns: Float32, encoded: Float32
-) -> NDArray[np.float64]:
-    """Distance (S,) of grey pixels (N,) to their prediction under each sun, without cast shadows."""
-    n, out = len(albedo), np.empty(len(suns))
-    cosine, albedo3, observed3 = np.empty(n, np.float32), np.empty((n, 1), np.float32), np.empty((n, 1), np.float32)
+) -> Float32:
+    """Distance (S,) of grey pixels (N,) to their prediction under each sun, without cast shadows.
+
+    All suns side by side, pixel after pixel: so the sums of one sun do not wait for each other.
+    """
+    n, n_suns = len(albedo), len(suns)
+    x, y, z = suns[:, 0].copy(), suns[:, 1].copy(), suns[:, 2].copy()
+    predicted = np.empty((n, n_suns), np.float32)
+    shade = np.empty(n_suns, np.int32)
     for i in range(n):
-        albedo3[i, 0], observed3[i, 0] = albedo[i], observed[i]
-    for s in range(len(suns)):
+        for s in range(n_suns):
+            cosine = normals[i, 0] * x[s] + normals[i, 1] * y[s] + normals[i, 2] * z[s]
+            shade[s] = np.int32(min(max(cosine, np.float32(0.0)), np.float32(1.0)) * np.float32(256.0))
+        for s in range(n_suns):
+            predicted[i, s] = albedo[i] * encoded[shade[s]]
+    return differences(predicted, observed, beside)
+
+
+@njit(cache=True, nogil=True)
+def differences(predicted: Float32, observed: Float32, beside: float) -> Float32:
+    """Share of differences (S,) of pixels (N,) to predictions (N, S), each at the exposure that suits it best."""
+    n, n_suns = predicted.shape
+    total, gain = np.float32(0.0), np.zeros(n_suns, np.float32)
+    for i in range(n):
+        total += observed[i]
+        gain += predicted[i]
+    if total + beside <= 0.0:
+        return np.ones(n_suns, np.float32)  # nothing is seen, nothing explained
+    for s in range(n_suns):
+        gain[s] = total / (gain[s] + np.float32(1e-6))
+    noise, white = np.float32(_NOISE_LEVEL), np.float32(255.0)
+    for _ in range(2):  # least absolute differences by reweighting
+        top, bottom = np.zeros(n_suns, np.float32), np.full(n_suns, np.float32(1e-6))
         for i in range(n):
-            c = normals[i, 0] * suns[s, 0] + normals[i, 1] * suns[s, 1] + normals[i, 2] * suns[s, 2]
-            cosine[i] = max(c, np.float32(0.0))
-        out[s] = _distance(cosine, albedo3, observed3, beside, encoded)
-    return out
+            bright = observed[i]
+            for s in range(n_suns):
+                p = predicted[i, s]
+                weighted = p / (abs(bright - gain[s] * p) + noise)
+                top[s] += weighted * bright
+                bottom[s] += weighted * p
+        for s in range(n_suns):
+            gain[s] = top[s] / bottom[s]
+    difference, both = np.full(n_suns, np.float32(beside)), np.full(n_suns, np.float32(beside + total + 1e-6))
+    for i in range(n):
+        bright = observed[i]
+        for s in range(n_suns):
+            p = min(gain[s] * predicted[i, s], white)
+            difference[s] += abs(bright - p)
+            both[s] += p
+    for s in range(n_suns):
+        difference[s] /= both[s]
+    return difference
 
 
 @njit(cache=True, nogil=True)

@@ -27,6 +27,15 @@ def test_the_best_matches_hold_the_true_view(scene, seed):
     assert found.score.max() <= 1.0 + 1e-6
 
 
+def test_a_mask_without_any_shape_is_matched_all_the_same(scene):
+    target, _, views = scene
+    mask = np.zeros((CAMERA.height, CAMERA.width), bool)
+    mask[50, 60] = True
+    found = match_shape(views, mask, whole_placement(mask), CAMERA, 10, 15.0, target.center_m)
+    assert len(found.view) > 0
+    assert np.isfinite(found.T_cam_target).all()
+
+
 def test_a_cut_mask_scores_what_lies_inside_only(scene):
     target, renderer, views = scene
     T_true = random_pose(np.random.default_rng(2), target, range_m=(5.0, 5.2))

@@ -5,6 +5,7 @@ from shape_scene import CAMERA, random_pose, spacecraft, sunlit_picture
 from hat_ros import lie
 from hat_ros.refinement.sunlight import SunMatcher, brightness
 from hat_ros.refinement.view import MaskField, TargetViewer, contour_lines
+from hat_ros.render.embree import pixel_rays
 from hat_ros.types import Frame
 
 SUNS = {"beside": (-1.0, 0.2, -0.3), "behind the camera": (0.2, -0.3, -1.0), "ahead": (0.7, 0.6, 0.3)}
@@ -34,21 +35,6 @@ def test_the_true_pose_explains_light_and_shadow_best(viewer, matcher, sun, seed
     truth = matcher.match(T_true, frame, mask)
     for rotvec in ((np.pi, 0, 0), (0, np.pi, 0), (0, 0, np.pi), (0.8, 0.0, 0.6)):
         assert truth.distance < matcher.match(turned(T_true, rotvec), frame, mask).distance
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_a_glance_tells_the_true_pose_from_turned_ones(viewer, matcher, seed):
-    T_true = random_pose(np.random.default_rng(seed), viewer.target)
-    frame, mask = sunlit_picture(viewer.target, T_true, SUNS["beside"])
-    turned_away = [turned(T_true, rotvec) for rotvec in ((np.pi, 0, 0), (0, np.pi, 0), (0, 0, np.pi))]
-    assert matcher.glance(T_true, frame, mask) < min(matcher.glance(T, frame, mask) for T in turned_away)
-
-
-def test_a_glance_past_the_target_sees_nothing(viewer, matcher):
-    T = random_pose(np.random.default_rng(2), viewer.target)
-    frame, mask = sunlit_picture(viewer.target, T, SUNS["beside"])
-    T[2, 3] = -5.0
-    assert matcher.glance(T, frame, mask) == 1.0
 
 
 def test_the_sun_is_found_where_it_is(viewer, matcher):
@@ -91,6 +77,19 @@ def test_a_target_behind_the_camera_has_no_light(viewer, matcher):
     frame, mask = sunlit_picture(viewer.target, T, SUNS["beside"])
     T[2, 3] = -5.0
     assert matcher.match(T, frame, mask) is None
+
+
+def test_many_suns_at_once_light_what_each_lights(viewer):
+    T = random_pose(np.random.default_rng(3), viewer.target)
+    R, t = T[:3, :3], T[:3, 3]
+    rays = pixel_rays(CAMERA, np.arange(0, CAMERA.width, 4), np.arange(0, CAMERA.height, 4)).reshape(-1, 3)
+    seen = viewer.surface(rays @ R, -t @ R)
+    suns = np.array(list(SUNS.values()), np.float32)
+    suns = (suns / np.linalg.norm(suns, axis=1, keepdims=True)) @ R.astype(np.float32)
+    together = viewer.sunlit_surfels(seen, suns)
+    for sun, cosine in zip(suns, together, strict=True):
+        alone = viewer.sunlit(seen.points_m, seen.face_id, seen.directions, sun)
+        np.testing.assert_allclose(cosine, alone, atol=1e-5)
 
 
 def test_brightness_grows_with_the_cosine():
