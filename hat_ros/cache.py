@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 
 Arrays = dict[str, NDArray]
 
+# Some fifty CAD models with all their views.
+MAX_BYTES = 4 * 2**30
 _MANIFEST = "manifest.json"
 
 
@@ -46,7 +48,9 @@ def cached_arrays(kind: str, key: str, build: Callable[[], Mapping[str, NDArray]
         return stored
     arrays = {name: np.ascontiguousarray(array) for name, array in build().items()}
     _write(entry, arrays)
-    return _read(entry) or arrays
+    stored = _read(entry)  # before another process may find the cache too large
+    _trim(entry.parent, keep=entry)
+    return stored or arrays
 
 
 def _digest(array: NDArray) -> str:
@@ -58,6 +62,8 @@ def _read(entry: Path) -> Arrays | None:
         digests = json.loads((entry / _MANIFEST).read_text(encoding="utf-8"))
         arrays = {name: np.load(entry / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in digests}
         if all(_digest(arrays[name]) == digests[name] for name in digests):
+            with contextlib.suppress(OSError):  # read-only
+                os.utime(entry)  # says when it was used last
             return arrays
     except (OSError, ValueError, TypeError, EOFError):  # absent, truncated, or not what we wrote
         return None
@@ -77,3 +83,19 @@ def _write(entry: Path, arrays: Arrays) -> None:
             fresh.rename(entry)  # another process may have been faster: its entry holds the same bytes
         finally:
             shutil.rmtree(fresh, ignore_errors=True)
+
+
+def _trim(folder: Path, keep: Path) -> None:
+    """Delete the entries that were not used for longest, until the rest fits; who has one mapped keeps its arrays."""
+    entries = []
+    for entry in folder.glob("*-*"):
+        with contextlib.suppress(OSError):  # deleted by another process
+            size = sum(file.stat().st_size for file in entry.iterdir())
+            entries.append((entry.stat().st_mtime_ns, entry, size))
+    excess = sum(size for _, _, size in entries) - MAX_BYTES
+    for _, entry, size in sorted(entries):
+        if excess <= 0:
+            break
+        if entry != keep:
+            shutil.rmtree(entry, ignore_errors=True)
+            excess -= size

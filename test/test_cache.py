@@ -1,6 +1,9 @@
+import os
+
 import numpy as np
 import pytest
 
+from hat_ros import cache
 from hat_ros.cache import cache_folder, cached_arrays
 
 
@@ -64,3 +67,24 @@ def test_a_cache_that_cannot_be_written_is_no_error(tmp_path, monkeypatch):
 def test_no_unfinished_entries_stay_behind():
     cached_arrays("thing", "key", build)
     assert [path.name.split("-")[0] for path in cache_folder().iterdir()] == ["thing"]
+
+
+def test_what_was_not_used_for_longest_makes_room(monkeypatch):
+    monkeypatch.setattr(cache, "MAX_BYTES", 3 * 4096)
+    page = {"a": np.arange(3872, dtype=np.uint8)}  # a page with header and manifest
+    old, *_ = [cached_arrays("thing", key, lambda: page)["a"] for key in ("old", "used", "new")]
+    for entry in cache_folder().iterdir():
+        os.utime(entry, (0, 0))
+    for key in ("used", "new"):
+        cached_arrays("thing", key, forbidden)
+    cached_arrays("thing", "newest", lambda: page)
+    for key in ("used", "new", "newest"):
+        cached_arrays("thing", key, forbidden)
+    assert len(list(cache_folder().iterdir())) == 3
+    np.testing.assert_array_equal(old, page["a"])  # who has it keeps it
+
+
+def test_an_entry_larger_than_the_cache_is_still_read(monkeypatch):
+    monkeypatch.setattr(cache, "MAX_BYTES", 10)
+    np.testing.assert_array_equal(cached_arrays("thing", "key", build)["a"], build()["a"])
+    cached_arrays("thing", "key", forbidden)
