@@ -33,12 +33,15 @@ def with_dim_parts(measured: Sky, lit: Mask) -> Mask:
     reach = round(_REACH_SHARE * max(w, h)) + _REACH_PX
     box = np.s_[max(0, y - reach) : y + h + reach, max(0, x - reach) : x + w + reach]
     mean3, step = measured.mean3[box], measured.threshold - measured.level
-    bright = (mean3 > measured.level + _BRIGHT_STEPS * step).astype(np.float32)
-    seen = (mean3 > measured.threshold).astype(np.uint8)
+    bright = cv2.threshold(mean3, measured.level + _BRIGHT_STEPS * step, 1, cv2.THRESH_BINARY)[1]
+    seen = cv2.threshold(mean3, measured.threshold, 1, cv2.THRESH_BINARY)[1]
     factor = -(-max(seen.shape) // _WORK_SIDE_PX)
     luma = _reduced(measured.luma[box], factor)
     ladder = [known for width in _WIDTHS_PX if (known := _noise(measured.luma, width, factor)) is not None]
     dim = _find(luma, _reduced(bright, factor) > 0, _reduced(seen, factor) > 0.5, step, ladder)
+    if not dim.any():
+        return lit
+    seen = seen.astype(np.uint8)
     dim = enlarge(dim, (seen.shape[1], seen.shape[0]))
     count, piece = cv2.connectedComponents(dim | seen | lit[box], connectivity=8)
     hangs_on = np.bincount(piece[lit[box] > 0], minlength=count) > 0
@@ -108,7 +111,7 @@ def _noise(image: NDArray[np.uint8], width: int, factor: int) -> tuple[int, floa
 def _reduced(image: NDArray[np.uint8] | NDArray[np.float32], factor: int) -> NDArray[np.float32]:
     """Means of ``factor`` x ``factor`` pixels."""
     size = (-(-image.shape[1] // factor), -(-image.shape[0] // factor))
-    image = image.astype(np.float32)
+    image = image.astype(np.float32, copy=False)
     return image if factor == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
