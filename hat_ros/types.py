@@ -52,13 +52,10 @@ class Camera:
     def project(self, points_cam: Float) -> Float:
         """Pixel coordinates of camera-frame points with z > 0: (..., 3) m -> (..., 2) px."""
         xy = points_cam[..., :2] / points_cam[..., 2:3]
-        return np.stack(
-            [
-                self.K[0, 0] * xy[..., 0] + self.K[0, 1] * xy[..., 1] + self.K[0, 2],
-                self.K[1, 1] * xy[..., 1] + self.K[1, 2],
-            ],
-            axis=-1,
-        )
+        uv = np.empty_like(xy)
+        uv[..., 0] = self.K[0, 0] * xy[..., 0] + self.K[0, 1] * xy[..., 1] + self.K[0, 2]
+        uv[..., 1] = self.K[1, 1] * xy[..., 1] + self.K[1, 2]
+        return uv
 
     def crop(self, x0: int, y0: int, width: int, height: int, scale: float = 1.0) -> Camera:
         """The camera of the crop starting at pixel (x0, y0), then resized by ``scale`` (area-preserving centres).
@@ -315,6 +312,8 @@ class Refined:
         support: share of the visible contour whose image evidence agrees with the pose, 0 to 1.
         visible_overlap: the overlap where the image is bright enough to tell: silhouette without mask counts by its
             brightness, because the shadowed side of a target is black on black. NaN without a silhouette mask.
+        misfit_px: mean distance of the visible outlines of silhouette and mask beyond what a good mask leaves; a
+            systematic error, of which the covariance knows nothing.
     """
 
     pose_row: Float
@@ -322,6 +321,7 @@ class Refined:
     overlap: float
     support: float
     visible_overlap: float = float("nan")
+    misfit_px: float = 0.0
 
     @cached_property
     def T_cam_target(self) -> Float:

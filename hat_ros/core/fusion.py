@@ -16,7 +16,7 @@ from hat_ros.core.confidence import BasinConfidence
 from hat_ros.core.refined import RefinedFusion
 from hat_ros.core.refiner import Refiner
 from hat_ros.core.selector import box_area_px, rotation_increment
-from hat_ros.core.uncertainty import ResidualCovariance
+from hat_ros.core.uncertainty import KeyframeSpread, ResidualCovariance
 from hat_ros.types import Detection, Estimate, Float, Frame, Motion, Selection, TrackState
 
 _NO_POSE = np.full(7, np.nan)
@@ -49,6 +49,7 @@ class FusionStage:
         self._refined = RefinedFusion(config, self._refiner) if self._refiner is not None else None
         self._area_confidence = AreaConfidence(config.fusion)
         self._covariance = ResidualCovariance()
+        self._spread = KeyframeSpread(config.fusion.gate_angle_deg)
         self._last_pose: Float | None = None
         self._last_quat = np.array([0.0, 0.0, 0.0, 1.0])
         self._last_motion = Motion.none()
@@ -81,6 +82,8 @@ class FusionStage:
         if state.has_pose:
             pose_row = self._row(T_cam_target)
             covariance = self._covariance.update(T_cam_target, fused.measurement, fused.predicted, fused.covariance)
+            if self._refined is not None:  # without a refiner the anchors are the residuals
+                covariance = covariance + self._spread.update(selection, T_cam_target)
         self._last_motion = motion
         return Estimate(
             stamp_ns=frame.stamp_ns,

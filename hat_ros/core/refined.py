@@ -242,13 +242,14 @@ class RefinedFusion:
             self._attitude.correct(T[:3, :3], predicted[:3, :3], refined.covariance[3:, 3:])
         else:
             self._attitude.restart(T[:3, :3], refined.covariance[3:, 3:])
-        # An unknown overlap (NaN) is never certain.
+        # Where a mask lacks parts, the robust fit follows what is left of it, wherever that lies, with small residuals:
+        # a pixel of misfit doubles the variance that they show. An unknown overlap (NaN) is never certain.
         certain = min(refined.overlap, refined.support) >= self._refinement.certain_share or self._n_agreed > 0
         return Fused(
             T,
             predicted,
             measurement=T,
-            covariance=refined.covariance,
+            covariance=(1.0 + refined.misfit_px**2) * refined.covariance,
             confirmed=certain,
             doubtful=self._n_disagreed > 1,
         )

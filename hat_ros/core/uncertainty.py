@@ -1,17 +1,20 @@
-"""Covariance of the output from the residuals that the filter really sees."""
+"""Covariance of the output from the residuals that the filter really sees, and from what keyframes say beside it."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from hat_ros import lie
-from hat_ros.types import Float
+from hat_ros.types import Float, Selection
 
 # Effective number of residuals that the running means remember.
 _MEMORY = 20
 # Before the first residual: a coarse pose is good to about a tenth of a radian, and as much of its range.
 _INITIAL_SIGMA_RAD = 0.1
 _INITIAL_SIGMA_SHARE = 0.1
+# Keyframes whose spread counts. So few tell a variance badly: Student's t with as many degrees of freedom reaches, at
+# 95 %, as far as a normal distribution of so many times the variance.
+_KEYFRAMES, _FEW = 4, 2.0
 
 
 class ResidualCovariance:
@@ -63,3 +66,47 @@ class ResidualCovariance:
         self._n = min(self._n + 1, _MEMORY)
         self._residual = self._residual + (square - self._residual) / self._n
         self._rate = self._rate + (square / self._frames_since - self._rate) / self._n
+
+
+class KeyframeSpread:
+    """Second moments of the hypotheses in the output's basin about the output, over the last keyframes.
+
+    One image's residuals know nothing of what they have in common: a mask without its dark parts, an outline that looks
+    alike from directions far apart (a cylinder about its axis). Hypotheses found apart from the track show it: where
+    image and model tell little, they scatter, and most in the direction of which least is known.
+
+    Args:
+        apart_deg: orientations further apart than this are different basins.
+    """
+
+    def __init__(self, apart_deg: float) -> None:
+        self._apart_rad = np.radians(apart_deg)
+        self._n = 0
+        self._mean = np.zeros((6, 6))
+
+    def update(self, selection: Selection, T_cam_target: Float) -> Float:
+        """Take in one frame, keyframe or not: its candidates, and its output (4, 4).
+
+        Candidates count as the decoder's path scores say, which are log-likelihoods.
+
+        Returns:
+            (6, 6) to add to the covariance of the output, in its convention; zero before the first keyframe.
+        """
+        square = self._second_moment(selection, T_cam_target)
+        if square is not None:
+            self._n = min(self._n + 1, _KEYFRAMES)
+            self._mean = self._mean + (square - self._mean) / self._n
+        return _FEW * self._mean
+
+    def _second_moment(self, selection: Selection, T_cam_target: Float) -> Float | None:
+        """(6, 6) of one keyframe; None where no candidate stands in the output's basin."""
+        T = selection.candidates.T_cam_target
+        apart_rad = lie.angle_between(T[:, :3, :3], T_cam_target[:3, :3])
+        near = np.isfinite(selection.path_score) & (apart_rad <= self._apart_rad)
+        if not near.any():
+            return None
+        path_score = selection.path_score[near]
+        weight = np.exp(path_score - path_score.max())
+        turn = lie.so3_log(T[near, :3, :3] @ T_cam_target[:3, :3].T)
+        error = np.concatenate([T[near, :3, 3] - T_cam_target[:3, 3], turn], axis=1)
+        return (weight[:, None] * error).T @ error / weight.sum()

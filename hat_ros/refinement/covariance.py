@@ -24,15 +24,13 @@ def outline_misfit_px(areas: Overlap, outline_px: float) -> float:
     """Mean distance between the outlines of silhouette and mask, in excess of what a good mask shows; pixels.
 
     Args:
-        areas: agreement and disagreement of the two.
+        areas: agreement and disagreement of the two. What is hidden in the dark is no disagreement.
         outline_px: length of the silhouette's outline.
     """
-    return max((areas.extra + areas.missing + areas.hidden) / max(outline_px, 1.0) - USUAL_MISFIT_PX, 0.0)
+    return max((areas.extra + areas.missing) / max(outline_px, 1.0) - USUAL_MISFIT_PX, 0.0)
 
 
-def outline_floor(
-    T_cam_target: NDArray[np.float64], focal_px: float, radius_m: float, misfit_px: float = 0.0
-) -> NDArray[np.float64]:
+def outline_floor(T_cam_target: NDArray[np.float64], focal_px: float, radius_m: float) -> NDArray[np.float64]:
     """(6, 6) what exposure, blur and the CAD model do to an outline, which no residual of one image shows.
 
     An outline that is some pixels too wide all around is a depth error of that share of the target's apparent radius;
@@ -40,11 +38,10 @@ def outline_floor(
 
     Args:
         T_cam_target: (4, 4) pose. focal_px: focal length. radius_m: bounding radius of the target.
-        misfit_px: what the outlines disagree by, see :func:`outline_misfit_px`.
     """
     position = T_cam_target[:3, 3]
     range_m = float(np.linalg.norm(position))
-    lateral_m = float(np.hypot(OUTLINE_SIGMA_PX, misfit_px)) * range_m / focal_px
+    lateral_m = OUTLINE_SIGMA_PX * range_m / focal_px
     depth_m = lateral_m * range_m / radius_m
     sight = position / range_m
     floor = np.zeros((6, 6))
@@ -53,14 +50,12 @@ def outline_floor(
     return floor
 
 
-def pose_covariance(fit: Fit, radius_m: float, misfit_px: float = 0.0) -> NDArray[np.float64] | None:
+def pose_covariance(fit: Fit, radius_m: float) -> NDArray[np.float64] | None:
     """(6, 6) covariance of ``[dt (m); r (rad)]``; None when nothing was measured.
 
     Args:
         fit: the last fit.
         radius_m: bounding radius of the target, the unit of rotations.
-        misfit_px: see :func:`outline_misfit_px`. Where a mask lacks parts, the robust fit follows what is left of it
-            with small residuals, wherever that lies: so a pixel of misfit doubles the variance that they show.
     """
     scale = np.array([1.0, 1.0, 1.0, radius_m, radius_m, radius_m, 1.0, 1.0])
     H = _symmetric(fit.information) / np.outer(scale, scale)
@@ -68,7 +63,7 @@ def pose_covariance(fit: Fit, radius_m: float, misfit_px: float = 0.0) -> NDArra
     if not np.isfinite(H).all() or level <= 0:
         return None
     H[:6, :6] += _WEAKEST * level * np.eye(6)
-    covariance = (1.0 + misfit_px**2) * np.linalg.inv(H)[:6, :6]
+    covariance = np.linalg.inv(H)[:6, :6]
     return covariance / np.outer(scale[:6], scale[:6])
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from hat_ros import lie
 from hat_ros.config import RefinementConfig
-from hat_ros.refinement.covariance import outline_floor, pose_covariance
+from hat_ros.refinement.covariance import outline_floor, outline_misfit_px, pose_covariance
 from hat_ros.refinement.refiner import WITH_MASK, WITHOUT_MASK, Fit, PoseFitter
 from hat_ros.refinement.sunlight import SunMatcher
 from hat_ros.refinement.view import MaskField, Overlap, TargetViewer, View
@@ -76,12 +76,15 @@ class FusedPoseRefiner:
             return None
         focal_px = float(frame.camera.K[0, 0])
         covariance = covariance + outline_floor(fit.T_cam_target, focal_px, self._target.bounding_radius_m)
-        overlap = visible_overlap = float("nan")
+        overlap, visible_overlap, misfit_px = float("nan"), float("nan"), 0.0
         if field is not None:
             # The last round starts close to where it ends: its view, shifted, shows what the result looks like.
             areas = field.compare(fit.view.shifted(fit.shift_px), luma)
             overlap, visible_overlap = areas.union_share, areas.visible_share
-        return Refined(lie.row_from_matrix(fit.T_cam_target), covariance, overlap, fit.support, visible_overlap)
+            misfit_px = outline_misfit_px(areas, fit.outline_px)
+        return Refined(
+            lie.row_from_matrix(fit.T_cam_target), covariance, overlap, fit.support, visible_overlap, misfit_px
+        )
 
     def _fit(
         self,
