@@ -87,7 +87,7 @@ def so3_right_jacobian_inverse(rotvec: Array) -> Array:
 def rotation_angle(R: Array) -> Array:
     """Smallest rotation angle in radians, in [0, pi]: (..., 3, 3) -> (...)."""
     q = quat_from_matrix(R)
-    return 2.0 * np.arctan2(np.linalg.norm(q[..., :3], axis=-1), q[..., 3])
+    return 2.0 * np.arctan2(np.sqrt(np.einsum("...i,...i->...", q[..., :3], q[..., :3])), q[..., 3])
 
 
 def angle_between(R_a: Array, R_b: Array) -> Array:
@@ -118,16 +118,15 @@ def matrix_from_quat(quat_xyzw: Array) -> Array:
     q = np.asarray(quat_xyzw, dtype=np.float64)
     if q.ndim == 1:
         return _matrix_from_quat_single(q)
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    return np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=-1),
-            np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=-1),
-            np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=-1),
-        ],
-        axis=-2,
-    )
+    q = q / np.sqrt(np.einsum("...i,...i->...", q, q))[..., None]
+    # Twice the products of all components.
+    p = 2 * q[..., :, None] * q[..., None, :]
+    R = np.empty(q.shape[:-1] + (3, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        R[..., i, i] = 1 - (p[..., j, j] + p[..., k, k])
+        R[..., i, j] = p[..., i, j] - p[..., k, 3]
+        R[..., j, i] = p[..., i, j] + p[..., k, 3]
+    return R
 
 
 def transform(R: Array, t: Array) -> Array:

@@ -36,9 +36,11 @@ def refine_outline(rgb: NDArray[np.uint8], mask: NDArray[np.uint8], band_px: int
     open_xy = cv2.findNonZero(inner ^ outer)
     if open_xy is None:
         return mask
-    step = 2 if band_px >= _WIDE_BAND_PX else 1
-    examples = np.ascontiguousarray(rgb[::step, ::step])
-    inside, outside = _area_table(examples, inner[::step, ::step]), _area_table(examples, 1 - outer[::step, ::step])
+    examples, known_inside, known_outside, step = rgb, inner, 1 - outer, 1
+    if band_px >= _WIDE_BAND_PX:
+        examples, known_inside, known_outside = (_every_second(each) for each in (rgb, inner, 1 - outer))
+        step = 2
+    inside, outside = _area_table(examples, known_inside), _area_table(examples, known_outside)
     reach, least = (2 * band_px + 2) // step, max(1, _MIN_PIXELS // step**2)
     moved = _decide(rgb, mask, open_xy[:, 0], *inside, *outside, step, reach, least, np.float32(contrast * contrast))
     # A lone pixel that disagrees with most of its neighbours is noise.
@@ -46,9 +48,14 @@ def refine_outline(rgb: NDArray[np.uint8], mask: NDArray[np.uint8], band_px: int
     return np.where(inner == outer, mask, smooth)
 
 
+def _every_second(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Every second pixel of every second row of an (h, w, ...) image, an odd rest dropped."""
+    h, w = image.shape[0] // 2, image.shape[1] // 2
+    return cv2.resize(image[: 2 * h, : 2 * w], (w, h), interpolation=cv2.INTER_NEAREST)
+
+
 def _area_table(rgb: NDArray[np.uint8], mask: NDArray[np.uint8]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Summed-area tables (h + 1, w + 1) of a 0/1 mask and (h + 1, w + 1, 3) of the colours in it."""
-    mask = np.ascontiguousarray(mask)
     return cv2.integral(mask, sdepth=cv2.CV_32S), cv2.integral(cv2.copyTo(rgb, mask), sdepth=cv2.CV_32S)
 
 
