@@ -18,6 +18,8 @@ from hat_ros.types import Frame
 
 # Outlines closer than this agree, pixels.
 _TOLERANCE_PX = 0.5
+# A pose whose parts moved less than this against each other is compared as it looked before, pixels.
+_SAME_VIEW_PX = 0.5
 # Mean distance of outlines at which a mismatch begins to saturate.
 _MISMATCH_PX = 0.3
 # Share of the mask's surroundings that is black before a black sky.
@@ -91,7 +93,9 @@ class Scorer:
 
     def evidence(self, fit: Fit, to_sun_cam: NDArray[np.float64] | None = None) -> Evidence | None:
         """Gather the evidence for a refined pose, or for its part that a sun shines on; None when it cannot be seen."""
-        view = self._viewer.view(fit.T_cam_target, self._frame.camera, self._render_px, to_sun_cam)
+        view: View | None = fit.view.shifted(fit.shift_px)
+        if fit.twist_px > _SAME_VIEW_PX:
+            view = self._viewer.view(fit.T_cam_target, self._frame.camera, self._render_px, to_sun_cam)
         if view is None:
             return None
         length = fit.lines[:, 2] * (fit.contour[:, 0] > 0)

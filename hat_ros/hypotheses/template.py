@@ -2,7 +2,8 @@
 
 1. The mask's shape is compared with every view at every in-plane angle (``matching``); the best distinct orientations
    are kept.
-2. Each is pulled onto the mask's boundary with the sparse contour of its view, no rendering needed.
+2. Each is pulled onto the mask's boundary with the sparse contour of its view, no rendering needed; the third that
+   lies on it best is kept.
 3. Each is rendered, compared with the mask, and refined again with its own contour on mask and image edges.
 4. The evidence of each is turned into a log-likelihood (``scoring``): how well its outline and the mask's agree, and
    how well it explains what is bright and what is dark (``refinement.sunlight``).
@@ -20,6 +21,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,13 +47,17 @@ from hat_ros.refinement.sunlight import SunMatcher
 from hat_ros.refinement.view import MaskField, TargetViewer
 from hat_ros.render import create_renderer
 from hat_ros.target import Target
-from hat_ros.types import Candidates, Detection, Frame, PosePrior
+from hat_ros.types import Camera, Candidates, Detection, Frame, PosePrior
 
 _VIEW_COUNTS = (162, 642, 2562)
 _CONTOUR_POINTS = 200
 # Robust scales as shares of the mask's longer side: how far off a coarse match is, in steps of refinement.
 _COARSE_SCALES = (0.10, 0.07, 0.05, 0.04, 0.03, 0.03)
 _MIN_SCALE_PX = 1.5
+# Share of the coarse matches that are refined: those whose contour lies nearest to the mask's. A point further from it
+# than this share of the mask's longer side may belong to a part that the mask lacks, and counts as that far.
+_REFINED_SHARE = 1 / 3
+_FAR_SHARE = 0.1
 # Before the mask's bias is known, outlines this close agree.
 _SELECTION_TOLERANCE_PX = 1.0
 # Best shape score below which the mask is taken to be incomplete.
@@ -188,15 +194,19 @@ class TemplateHypotheses:
     def _pulled(
         self, bank: ViewBank, matches: ShapeMatches, frame: Frame, field: MaskField
     ) -> list[NDArray[np.float64]]:
-        """Matches pulled onto the mask's boundary with the contour of their views."""
+        """Matches pulled onto the mask's boundary with the contour of their views: those that lie on it best."""
         scales = np.maximum(np.array(_COARSE_SCALES) * field.size_px, _MIN_SCALE_PX)
         lines = np.zeros((bank.contour_m.shape[1], 5))
-        out = []
-        for T, view in zip(matches.T_cam_target, matches.view, strict=True):
+        pulled, distance_px = [], []
+        for T_coarse, view in zip(matches.T_cam_target, matches.view, strict=True):
             used = bank.contour_weight[view] > 0
             lines[:, 2] = bank.contour_weight[view]
-            out.append(self._fitter.pull(T, bank.contour_m[view][used], lines[used], frame, field, scales))
-        return out
+            points_m = bank.contour_m[view][used]
+            T = self._fitter.pull(T_coarse, points_m, lines[used], frame, field, scales)
+            pulled.append(T)
+            distance_px.append(_outline_distance_px(T, points_m, frame.camera, field))
+        n_kept = max(1, int(np.ceil(_REFINED_SHARE * len(pulled))))
+        return [pulled[i] for i in np.argsort(distance_px, kind="stable")[:n_kept]]
 
     def _align(self, starts: list[Start], frame: Frame, scorer: Scorer) -> list[Aligned]:
         """Refine on the mask with rendered contours, and compare shapes."""
@@ -256,3 +266,14 @@ class TemplateHypotheses:
         worst = np.nanmin(light) if len(poses) else 0.0
         light = np.nan_to_num(light, nan=worst)
         return [(T, score + float(extra)) for T, score, extra in zip(poses, scores, light, strict=True)]
+
+
+def _outline_distance_px(
+    T_cam_target: NDArray[np.float64], points_m: NDArray[np.float64], camera: Camera, field: MaskField
+) -> float:
+    """Mean distance of contour points (N, 3) from a mask's outline, pixels; far ones count as not quite so far."""
+    uv = camera.project(points_m @ T_cam_target[:3, :3].T + T_cam_target[:3, 3]) - field.origin_px
+    distance = cv2.remap(
+        field.distance, uv[None].astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    return float(np.minimum(np.abs(distance), _FAR_SHARE * field.size_px).mean())

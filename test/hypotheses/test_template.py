@@ -10,6 +10,8 @@ from hat_ros.hypotheses import template
 from hat_ros.hypotheses.matching import match_shape
 from hat_ros.hypotheses.stage import HypothesisStage
 from hat_ros.hypotheses.template import TemplateHypotheses
+from hat_ros.refinement.view import MaskField, TargetViewer, contour_lines
+from hat_ros.render import create_renderer
 from hat_ros.types import Camera, Detection, Frame, PosePrior
 
 
@@ -179,3 +181,16 @@ def test_the_stage_asks_at_keyframes_only(target, tmp_path, monkeypatch):
 def test_impossible_banks_are_refused(target, options):
     with pytest.raises(ConfigError, match=next(iter(options))):
         TemplateHypotheses(HatConfig(hypotheses=HypothesesConfig(template=TemplateConfig(**options))), target)
+
+
+def test_a_contour_on_the_outline_is_nearer_to_it_than_one_beside(target):
+    viewer = TargetViewer(target)
+    T = random_pose(np.random.default_rng(0), target)
+    view = viewer.view(T, CAMERA, 160)
+    points_m = contour_lines(view, 96).points_m
+    field = MaskField(create_renderer("embree", target).render(T, CAMERA, color=False).mask)
+    beside, gone = T.copy(), T.copy()
+    beside[0, 3] += 0.05 * T[2, 3]
+    gone[0, 3] += 10.0 * T[2, 3]
+    distances = [template._outline_distance_px(pose, points_m, CAMERA, field) for pose in (T, beside, gone)]
+    assert distances[0] < 1.0 < distances[1] < distances[2] <= 0.1 * field.size_px + 1e-6
