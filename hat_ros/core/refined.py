@@ -32,6 +32,7 @@ from hat_ros.core.attitude import AttitudeFilter
 from hat_ros.core.causal import Dissent, Fused, fuse_two, relative_motion
 from hat_ros.core.prior import extrapolate
 from hat_ros.core.refiner import Refiner
+from hat_ros.core.uncertainty import widened
 from hat_ros.types import Detection, Float, Frame, Motion, Refined, RotationPrior
 
 # Measured outputs behind the constant-rate prediction.
@@ -242,17 +243,21 @@ class RefinedFusion:
             self._attitude.correct(T[:3, :3], predicted[:3, :3], refined.covariance[3:, 3:])
         else:
             self._attitude.restart(T[:3, :3], refined.covariance[3:, 3:])
-        # Where a mask lacks parts, the robust fit follows what is left of it, wherever that lies, with small residuals:
-        # a pixel of misfit doubles the variance that they show. An unknown overlap (NaN) is never certain.
+        # An unknown overlap (NaN) is never certain.
         certain = min(refined.overlap, refined.support) >= self._refinement.certain_share or self._n_agreed > 0
         return Fused(
             T,
             predicted,
             measurement=T,
-            covariance=(1.0 + refined.misfit_px**2) * refined.covariance,
+            covariance=widened(refined.covariance, refined.misfit_px, self._basin(T)),
             confirmed=certain,
             doubtful=self._n_disagreed > 1,
         )
+
+    def _basin(self, T_cam_target: Float) -> Float:
+        """(6,) sigmas, metres and radians: how far off a refinement in the right basin can be."""
+        shift_m = self._refinement.max_shift * float(np.linalg.norm(T_cam_target[:3, 3]))
+        return np.repeat([shift_m, np.radians(self._fusion.gate_angle_deg)], 3)
 
 
 def is_supported(refined: Refined | None, config: RefinementConfig) -> bool:

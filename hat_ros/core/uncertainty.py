@@ -17,6 +17,21 @@ _INITIAL_SIGMA_SHARE = 0.1
 _KEYFRAMES, _FEW = 4, 2.0
 
 
+def widened(covariance: Float, misfit_px: float, basin: Float) -> Float:
+    """Covariance (6, 6) of a measurement whose outline and mask disagree.
+
+    Where a mask lacks parts, the robust fit follows what is left of it, wherever that lies, with small residuals: a
+    pixel of misfit doubles the variance that they show, but never beyond what a refinement can be off within its basin.
+
+    Args:
+        covariance: (6, 6) of what residuals show.
+        misfit_px: see ``Refined.misfit_px``.
+        basin: (6,) sigmas that bound it, in the same units.
+    """
+    information = np.linalg.inv((1.0 + misfit_px**2) * covariance)
+    return np.linalg.inv(information + np.diag(basin**-2.0)) if misfit_px > 0.0 else covariance
+
+
 class ResidualCovariance:
     """Running second moments of measurement minus prediction, in the convention of ``Estimate.covariance``.
 
