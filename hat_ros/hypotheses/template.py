@@ -58,6 +58,9 @@ _MIN_SCALE_PX = 1.5
 # than this share of the mask's longer side may belong to a part that the mask lacks, and counts as that far.
 _REFINED_SHARE = 1 / 3
 _FAR_SHARE = 0.1
+# Without a prior there is nothing to fall back on: so many times as many coarse matches are looked at (six times found
+# no more right poses than three on clips with doubtful masks, and more wrong ones).
+_UNAIDED_FACTOR = 3
 # Before the mask's bias is known, outlines this close agree.
 _SELECTION_TOLERANCE_PX = 1.0
 # Best shape score below which the mask is taken to be incomplete.
@@ -123,7 +126,8 @@ class TemplateHypotheses:
             return Candidates.none()
         field = MaskField(mask)
         scorer = Scorer(self._viewer, frame, field, self._options.render_px)
-        starts, n_coarse = [], self._options.n_coarse
+        starts = []
+        n_coarse = n_usual = self._options.n_coarse * (_UNAIDED_FACTOR if prior is None else 1)
         if prior is not None:
             starts.append(Start(self._fitter.centred(prior.T_cam_target, frame.camera, field, scorer.luma)))
             if prior.healthy:
@@ -131,11 +135,14 @@ class TemplateHypotheses:
         placements = whole_placement(mask)
         aligned = self._align(starts + self._coarse(placements, frame, field, n_coarse), frame, scorer)
         best = max(aligned, key=lambda a: a.score, default=None)
-        if best is None or (best.score < _POOR_SCORE and not self._confirms(best.T_cam_target, prior)):
+        # Light will find what lies in shadow; without a prior both ways are tried.
+        relies_on_light = scorer.dark_around and prior is not None
+        explained = best is not None and (best.score >= _POOR_SCORE or self._confirms(best.T_cam_target, prior))
+        if best is None or not (explained or relies_on_light):
             # The mask is not the whole silhouette: look for those that it may be a part of.
             cut = detection.touches_border()
             placements = cut_placements(mask) if cut else partial_placements(mask)
-            n_coarse = self._options.n_coarse
+            n_coarse = n_usual
             aligned += self._align(self._coarse(placements, frame, field, n_coarse), frame, scorer)
         selected = self._select(aligned, self._max_candidates)
         scored = self._finish(selected, frame, scorer)
@@ -145,7 +152,7 @@ class TemplateHypotheses:
             lit = self._align(self._sunlit(starts + self._coarse_lit(frame, scorer), frame, scorer), frame, scorer)
             scored += self._finish(lit, frame, scorer)
         elif not self._is_clear(scored, prior):
-            further = self._coarse(placements, frame, field, _MORE_COARSE * self._options.n_coarse, n_coarse)
+            further = self._coarse(placements, frame, field, _MORE_COARSE * n_usual, n_coarse)
             aligned += self._align(further, frame, scorer)
             more = self._select(aligned, 2 * self._max_candidates)
             scored += self._finish([start for start in more if start not in selected], frame, scorer)
