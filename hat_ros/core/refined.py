@@ -15,7 +15,7 @@ At keyframes the selected anchor competes with the track:
 
 With no refinement supported, the output is what the paper's fusion makes of prediction and anchor, and it coasts. A
 supported output is called TRACKING only if it is beyond doubt as well (``core.confidence``): the image is certain, or a
-second anchor has agreed, or the decoder's lead is large; and no two anchors in a row have disagreed since.
+second anchor has come out close to where the track expected it, or the decoder's lead is large; and no two anchors in a row have disagreed since.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ from hat_ros.core.refiner import Refiner
 from hat_ros.core.uncertainty import widened
 from hat_ros.types import Detection, Float, Frame, Motion, Refined, RotationPrior
 
+# An anchor further from where the track expected it than this share of D shares its basin, but bears no witness to it.
+_CLOSE_SHARE = 0.5
 # Measured outputs behind the constant-rate prediction.
 _RATE_HISTORY = 6
 
@@ -120,7 +122,9 @@ class RefinedFusion:
         reference = track.T_cam_target if is_supported(track, self._refinement) else predicted
         if not self._dissent.update(anchor, reference):
             self._forget_rivals()
-            self._n_agreed += decided
+            apart_rad = lie.angle_between(anchor[:3, :3], predicted[:3, :3])
+            close = apart_rad <= np.radians(_CLOSE_SHARE * self._fusion.gate_angle_deg)
+            self._n_agreed = self._n_agreed + decided if close else 0
             self._n_disagreed = 0
             return self._agree(frame, detection, track, predicted, anchor, confidence)
         return self._arbitrate(frame, detection, track, predicted, anchor)

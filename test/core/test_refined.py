@@ -180,6 +180,15 @@ def test_an_uncertain_start_is_tracking_only_after_a_second_anchor_agreed(scene)
     assert {e.state for e in certain} == {TrackState.TRACKING}
 
 
+@pytest.mark.parametrize(("apart_deg", "believed"), [(5.0, True), (20.0, False)])
+def test_an_anchor_far_from_where_the_track_expected_it_bears_no_witness(scene, apart_deg, believed):
+    turn = lie.so3_exp(np.radians([apart_deg, 0.0, 0.0]))
+    anchor = lambda i, T: T if i == 0 else lie.transform(turn @ T[:3, :3], T[:3, 3])  # noqa: E731
+    stage = _stage(scene, evidence=lambda index: {"true": (0.7, 0.7)})
+    estimates = _run(stage, scene, range(10), anchor)
+    assert (estimates[-1].state == TrackState.TRACKING) == believed
+
+
 def test_a_track_that_anchors_contradict_is_in_doubt_until_two_agree(scene):
     """Rivals without image support and without coherence: nothing to follow, but no certainty either."""
     turns = {40: [np.pi, 0, 0], 48: [0, 0, np.pi]}
