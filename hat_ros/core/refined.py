@@ -15,7 +15,8 @@ At keyframes the selected anchor competes with the track:
 
 With no refinement supported, the output is what the paper's fusion makes of prediction and anchor, and it coasts. A
 supported output is called TRACKING only if it is beyond doubt as well (``core.confidence``): the image is certain, or a
-second anchor has come out close to where the track expected it, or the decoder's lead is large; and no two anchors in a row have disagreed since.
+second anchor came out close to where the track expected it, or the decoder's lead is large; and no two anchors in a row
+have disagreed since.
 """
 
 from __future__ import annotations
