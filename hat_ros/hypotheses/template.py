@@ -12,9 +12,10 @@ A pose predicted from the past is one more start, however little it is trusted: 
 that did not compete would lose to chance.
 
 Unless the best candidate is where a healthy track expects it, more is tried. A mask that no view fits well is matched
-as part of a silhouette, unless light is going to tell and there is a prior. Before a black sky the mask holds what is lit, which need not be the whole target: matches of
-brightness (``lit_bank``) compete as well, and of those only the sunlit part of the contour is compared with the mask.
-Before anything else more shape matches are tried where no candidate leads clearly.
+as part of a silhouette, unless light is going to tell and there is a prior. Before a black sky the mask holds what is
+lit, which need not be the whole target: matches of brightness (``lit_bank``) compete as well, and of those only the
+sunlit part of the contour is compared with the mask. Before anything else more shape matches are tried where no
+candidate leads clearly.
 """
 
 from __future__ import annotations
