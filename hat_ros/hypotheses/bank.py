@@ -142,8 +142,7 @@ class PolarSampler:
 
     def grid(self, center_px: NDArray[np.float64], gyration_px: float, n_angles: int) -> NDArray[np.float32]:
         """(n_angles, rings) about a centre, pixels."""
-        radius = (np.arange(N_RINGS) + 0.5) * (gyration_px * MAX_RADIUS / N_RINGS)
-        angle = (np.arange(n_angles) * (2.0 * np.pi / n_angles))[:, None]
+        radius, angle = _polar(gyration_px, n_angles)
         image, left, top = self._average(int(gyration_px * MAX_RADIUS / N_RINGS))
         x = (center_px[0] - left + radius * np.cos(angle)).astype(np.float32)
         y = (center_px[1] - top + radius * np.sin(angle)).astype(np.float32)
@@ -164,13 +163,18 @@ def border_grid(
     shape: tuple[int, ...], center_px: NDArray[np.float64], gyration_px: float, n_angles: int
 ) -> NDArray[np.float32]:
     """The :func:`polar_grid` of an image (H, W) of ones: what of the grid lies inside the image."""
-    radius = (np.arange(N_RINGS) + 0.5) * (gyration_px * MAX_RADIUS / N_RINGS)
-    angle = (np.arange(n_angles) * (2.0 * np.pi / n_angles))[:, None]
+    radius, angle = _polar(gyration_px, n_angles)
     inside = np.ones((n_angles, N_RINGS))
     for middle, size, direction in zip(center_px, shape[::-1], (np.cos(angle), np.sin(angle)), strict=True):
         at = middle + radius * direction
         inside *= np.clip(np.minimum(at + 1.0, size - at), 0.0, 1.0)
     return inside.astype(np.float32) * ring_weights()
+
+
+def _polar(gyration_px: float, n_angles: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Radii (rings,) of a polar grid, pixels, and its angles (n_angles, 1), radians."""
+    radius_px = (np.arange(N_RINGS) + 0.5) * (gyration_px * MAX_RADIUS / N_RINGS)
+    return radius_px, (np.arange(n_angles) * (2.0 * np.pi / n_angles))[:, None]
 
 
 def ring_weights() -> NDArray[np.float32]:
