@@ -9,6 +9,7 @@ is found although nobody has seen its colour.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -40,6 +41,8 @@ _CONTRADICTED = 0.5  # share that is ground
 CLEAR = 0.9  # from so many lengths back none of the target is where it is now
 
 _NO_POINTS = np.zeros((0, 1, 2), np.float32)
+_NO_MOTION = np.zeros((0, 3, 3))
+_STANDSTILL = np.eye(3)[None]
 _K3 = np.ones((3, 3), np.uint8)
 _K5 = np.ones((5, 5), np.uint8)
 
@@ -75,11 +78,10 @@ class GroundEvidence:
 
 @dataclass
 class _Remembered:
-    """A frame at reduced scale, where the target was not (0/1), and the (3, 3) homography to the newest frame."""
+    """A frame at reduced scale, and where the target was not (0/1)."""
 
     rgb: NDArray[np.uint8]
     free: Mask
-    H_now_then: NDArray[np.float64]
 
 
 class GroundMemory:
@@ -91,6 +93,7 @@ class GroundMemory:
     def reset(self) -> None:
         """Forget earlier frames."""
         self._frames: list[_Remembered] = []
+        self._H_now_then = _NO_MOTION  # homographies of the frames to the newest
         self._points = _NO_POINTS
         self._n_chosen = 0  # points to start with
         self._grey: NDArray[np.uint8] | None = None
@@ -114,8 +117,9 @@ class GroundMemory:
                 self._points = _NO_POINTS  # they may have been the target's
             self._carry(self._follow(grey))
         else:
-            self._frames, self._points = [], _NO_POINTS
-        self._frames.append(_Remembered(small, np.ones(grey.shape, np.uint8), np.eye(3)))
+            self._frames, self._H_now_then, self._points = [], _NO_MOTION, _NO_POINTS
+        self._frames.append(_Remembered(small, np.ones(grey.shape, np.uint8)))
+        self._H_now_then = np.concatenate([self._H_now_then, _STANDSTILL])
         self._grey = grey
         self._scale = (small.shape[1] / rgb.shape[1], small.shape[0] / rgb.shape[0])
         return whole
@@ -148,16 +152,17 @@ class GroundMemory:
     def _carry(self, H_next_prev: NDArray[np.float64] | None) -> None:
         """Take the next frame's view; forget what is too close to its neighbour, or all where the ground was lost."""
         if H_next_prev is None:
-            self._frames = []
+            self._frames, self._H_now_then = [], _NO_MOTION
             return
-        for frame in self._frames:
-            frame.H_now_then = H_next_prev @ frame.H_now_then
+        H = H_next_prev @ self._H_now_then
         height, width = self._grey.shape
-        if len(self._frames) >= 2:
-            apart = np.diff(_carried(self._frames[-2:], (width / 2, height / 2)), axis=0)
-            if np.linalg.norm(apart) < _SPACING_PX:
+        if len(H) >= 2:
+            (x0, y0), (x1, y1) = _carried(H[-2:], (width / 2, height / 2))
+            if math.hypot(x1 - x0, y1 - y0) < _SPACING_PX:
+                H = H[:-1]
                 del self._frames[-1]
         del self._frames[:-_MAX_FRAMES]
+        self._H_now_then = H[-_MAX_FRAMES:]
 
     def evidence(self, window: Window, length_px: float) -> GroundEvidence | None:
         """Compare a window of the newest frame with the ground; None while too little of it is known.
@@ -170,7 +175,7 @@ class GroundMemory:
         compared = self._compared(window, length_px)
         if not compared:
             return None
-        changes = [_compare(window.rgb, frame, to_window @ frame.H_now_then) for frame, _ in compared]
+        changes = [_compare(window.rgb, self._frames[i], to_window @ self._H_now_then[i]) for i, _ in compared]
         least, known = _least(changes)
         ground = np.zeros_like(known)
         clear = [
@@ -194,7 +199,8 @@ class GroundMemory:
         """(n,) how far the ground in the middle of a window has moved since each past frame, full resolution."""
         sx, sy = self._scale
         middle = ((window.x0 + window.width / 2) * sx, (window.y0 + window.height / 2) * sy)
-        return np.linalg.norm(_carried(self._frames[:-1], middle) - middle, axis=1) / sx
+        dx, dy = (_carried(self._H_now_then[:-1], middle) - middle).T
+        return np.sqrt(dx * dx + dy * dy) / sx
 
     def _to_window(self, window: Window) -> NDArray[np.float64]:
         """(3, 3) from the remembered scale to a window's, pixel centres at integers."""
@@ -208,22 +214,20 @@ class GroundMemory:
             ]
         )
 
-    def _compared(self, window: Window, length_px: float) -> list[tuple[_Remembered, float]]:
-        """The frames worth a comparison with the shift of the ground in the window since, full-resolution pixels."""
-        past, shifts_px = self._frames[-2::-1], self._shifts_px(window)[::-1]
-        chosen = []
+    def _compared(self, window: Window, length_px: float) -> list[tuple[int, float]]:
+        """Numbers of the frames worth a comparison, with the shift of the ground since, full-resolution pixels."""
+        shifts_px = self._shifts_px(window)
+        chosen: dict[int, float] = {}
         for lag in _LAGS:
             far = np.flatnonzero(shifts_px >= max(lag * length_px, _MIN_SHIFT_PX))
-            if len(far) and far[0] not in chosen:
-                chosen.append(far[0])
-        return [(past[i], float(shifts_px[i])) for i in chosen]
+            if len(far):
+                chosen[int(far[-1])] = float(shifts_px[far[-1]])
+        return list(chosen.items())
 
 
-def _carried(frames: list[_Remembered], at: tuple[float, float]) -> NDArray[np.float64]:
-    """(n, 2) where the ground that was at a point in each frame is now."""
-    if not frames:
-        return np.zeros((0, 2))
-    now = np.stack([frame.H_now_then for frame in frames]) @ np.array([*at, 1.0])
+def _carried(H_now_then: NDArray[np.float64], at: tuple[float, float]) -> NDArray[np.float64]:
+    """(n, 2) where the ground that was at a point in each frame is now: by (n, 3, 3) homographies."""
+    now = H_now_then @ np.array([*at, 1.0])
     return now[:, :2] / now[:, 2:]
 
 

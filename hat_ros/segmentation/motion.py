@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hat_ros.segmentation.masks import Window
+
 _MAX_LAG = 8  # frames
 _MIN_LAG = 2
 _BORDER_SHARE = 0.12  # width of the border that the shift must explain, of the shorter side
@@ -49,9 +51,14 @@ class MotionEvidence:
 
 
 class MotionDetector:
-    """Remembers reduced frames and finds what moved against the background."""
+    """Remembers reduced frames and finds what moved against the background.
 
-    def __init__(self) -> None:
+    Args:
+        side_px: longer side of the image that is searched; larger frames are reduced once somebody asks.
+    """
+
+    def __init__(self, side_px: int) -> None:
+        self._side_px = side_px
         self._frames: deque[NDArray[np.uint8]] = deque(maxlen=_MAX_LAG + 1)
 
     def push(self, rgb: NDArray[np.uint8]) -> None:
@@ -65,9 +72,9 @@ class MotionDetector:
         lag = len(self._frames) - 1
         if lag < _MIN_LAG or min(self._frames[-1].shape[:2]) < 24:
             return None
-        now = self._frames[-1]
-        far, far_change = _compare(now, self._frames[-1 - lag])
-        near, _ = _compare(now, self._frames[-1 - lag // 2])
+        now, before, long_before = (Window.whole(self._frames[-1 - k], self._side_px).rgb for k in (0, lag // 2, lag))
+        far, far_change = _compare(now, long_before)
+        near, _ = _compare(now, before)
         # Where the target was before differs too, but hardly in the same place at both lags.
         moving = cv2.medianBlur((np.minimum(far, near) > _MIN_STEP).astype(np.uint8), 3)
         size = 2 * max(1, round(0.02 * max(now.shape))) + 1

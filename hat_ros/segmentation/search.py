@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -53,6 +54,26 @@ class Found:
     models: region.ColorModels
 
 
+@dataclass(frozen=True)
+class _Newest:
+    """The newest frame at the scale of a search, reduced once somebody asks."""
+
+    rgb: NDArray[np.uint8]
+    remembered: Window
+    detector: MotionDetector
+    side_px: int
+
+    @cached_property
+    def window(self) -> Window:
+        """The whole image."""
+        return Window.whole(self.rgb, self.side_px, self.remembered)
+
+    @cached_property
+    def motion(self) -> MotionEvidence | None:
+        """What moved."""
+        return self.detector.evidence()
+
+
 class Search:
     """Remembers how the background moves and finds what is not it.
 
@@ -68,20 +89,20 @@ class Search:
 
     def reset(self) -> None:
         """Forget earlier frames."""
-        self._motion = MotionDetector()
+        self._motion = MotionDetector(self._config.cold_side_px)
         self.ground.reset()
         self._turn = 0
 
     def push(self, rgb: NDArray[np.uint8], mask_before: Mask | None = None) -> None:
         """Show it the newest image, (H, W, 3) uint8, and the previous one's mask; to be called once per frame."""
         remembered = self.ground.push(rgb, mask_before)
-        self._window = Window.whole(rgb, self._config.cold_side_px, remembered)
-        self._motion.push(self._window.rgb)
+        self._newest = _Newest(rgb, remembered, self._motion, self._config.cold_side_px)
+        self._motion.push(remembered.rgb)
 
     def judge(self, mask: Mask) -> tuple[float, float]:
         """Plausibility of a full-resolution mask in the newest image, and what a new find would need."""
         small = shrink(mask, self._config.cold_side_px)
-        motion = self._motion.evidence()
+        motion = self._newest.motion
         return self._plausibility(small, motion), self._required(small, motion)
 
     def confirms(self, mask: Mask) -> bool:
@@ -91,13 +112,13 @@ class Search:
         """
         small = shrink(mask, self._config.cold_side_px)
         kinds: list[str | None] = list(touched_sides(mask)) or [None]
-        motion = self._motion.evidence() if self._turn % 2 else None
+        motion = self._newest.motion if self._turn % 2 else None
         kind = kinds[self._turn // 2 % len(kinds)]
         self._turn += 1
         if motion is not None:
-            cut = region.cut_from_motion(self._window.rgb, motion.moving)
+            cut = region.cut_from_motion(self._newest.window.rgb, motion.moving)
         else:
-            cut = region.cut_from_nothing(self._window.rgb, kind, small)
+            cut = region.cut_from_nothing(self._newest.window.rgb, kind, small)
         return cut is not None and overlap(cut, small) >= AGREEMENT
 
     def find(self, rgb: NDArray[np.uint8], open_sides: tuple[str, ...]) -> Found | None:
@@ -110,8 +131,8 @@ class Search:
         found = self.before_ground(rgb)
         if found is not None:
             return found
-        whole = self._window
-        motion = self._motion.evidence()
+        whole = self._newest.window
+        motion = self._newest.motion
         cuts = [region.cut_from_nothing(whole.rgb)]
         if motion is not None:
             cuts.append(region.cut_from_motion(whole.rgb, motion.moving))

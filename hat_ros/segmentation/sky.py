@@ -82,8 +82,8 @@ def dark_border_share(rgb: NDArray[np.uint8]) -> float:
 
 def _dark_border(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Which pixels of the border are black in every channel (a dark sea is blue)."""
-    brightest = np.concatenate([rgb[strip].reshape(-1, 3) for strip in _border(rgb.shape)]).max(axis=1)
-    return brightest < SKY_MAX
+    red, green, blue = np.concatenate([rgb[strip].reshape(-1, 3) for strip in _border(rgb.shape)]).T
+    return np.maximum(np.maximum(red, green), blue) < SKY_MAX
 
 
 def _border(shape: tuple[int, ...]) -> tuple[tuple[slice, slice], ...]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from hat_ros import lie
@@ -57,6 +58,7 @@ class FeatureSlam:
         self._camera: Camera | None = None
         self._forget()
         rehearse(self._config)
+        depth_beside(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1))
 
     def update(self, frame: Frame, detection: Detection | None, prior: PosePrior | None) -> Motion:
         """Advance by one frame.
@@ -185,16 +187,9 @@ class FeatureSlam:
         if not len(slots) or not len(known):
             return
         z = window.points_in_camera(window.R[-1], window.t[-1])[known, 2]
-        distance_sq = ((tracks.xy[slots][:, None] - tracks.xy[known]) ** 2).sum(axis=-1)
-        nearest = np.argsort(distance_sq, axis=1, kind="stable")[:, :_NEIGHBOURS]
-        weight = 1.0 / (np.take_along_axis(distance_sq, nearest, axis=1) + _NEIGHBOUR_SOFTENING_PX**2)
-        relief = max(1.48 * float(np.median(np.abs(z - np.median(z)))), 0.1 * window.radius)
-        window.place(
-            slots,
-            self._normalise(tracks.xy[slots]),
-            (weight * z[nearest]).sum(axis=1) / weight.sum(axis=1),
-            _NEIGHBOUR_SIGMA * relief,
-        )
+        z_new, relief = depth_beside(tracks.xy[slots], tracks.xy[known], z)
+        sigma = _NEIGHBOUR_SIGMA * max(relief, 0.1 * window.radius)
+        window.place(slots, self._normalise(tracks.xy[slots]), z_new, sigma)
         self._n_wrong[slots] = 0
 
     def _motion(self) -> Motion:
@@ -210,6 +205,24 @@ class FeatureSlam:
         K = self._camera.K
         y = (xy[..., 1] - K[1, 2]) / K[1, 1]
         return np.stack([(xy[..., 0] - K[0, 2] - K[0, 1] * y) / K[0, 0], y], axis=-1)
+
+
+@njit(cache=True, nogil=True)
+def depth_beside(xy: Float, xy_known: Float, z_known: Float) -> tuple[Float, float]:
+    """Depth (n,) at (n, 2) pixels from the nearest of (m, 2) known ones (m,), and the relief: one sigma of these."""
+    out = np.empty(len(xy))
+    n_near = min(_NEIGHBOURS, len(xy_known))
+    for i in range(len(xy)):
+        distance_sq = (xy_known[:, 0] - xy[i, 0]) ** 2 + (xy_known[:, 1] - xy[i, 1]) ** 2
+        total = depth = 0.0
+        for _ in range(n_near):
+            nearest = np.argmin(distance_sq)
+            weight = 1.0 / (distance_sq[nearest] + _NEIGHBOUR_SOFTENING_PX**2)
+            total += weight
+            depth += weight * z_known[nearest]
+            distance_sq[nearest] = np.inf
+        out[i] = depth / total
+    return out, 1.48 * float(np.median(np.abs(z_known - np.median(z_known))))
 
 
 def bulge(region: Image, xy: Float) -> Float:

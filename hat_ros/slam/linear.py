@@ -52,6 +52,31 @@ def turn_between(R_b: Float, R_a: Float) -> Float:
 
 
 @njit(cache=True, nogil=True)
+def robust_mean_rotation(R: Float, cutoff_rad: float) -> Float:
+    """Mean of (n, 3, 3) rotations that those further off than a few times ``cutoff_rad`` do not move.
+
+    From the medoid, thrice reweighted (Geman-McClure).
+    """
+    mean, least = R[0], np.inf
+    for i in range(len(R)):
+        cost = 0.0
+        for j in range(len(R)):
+            # The squared chordal distance 3 - tr(A B^T) is the squared angle, for small ones.
+            cost += min(3.0 - np.sum(R[i] * R[j]), (3.0 * cutoff_rad) ** 2)
+        if cost < least:
+            mean, least = R[i], cost
+    for _ in range(3):
+        turn, total = np.zeros(3), 0.0
+        for i in range(len(R)):
+            d = turn_between(R[i], mean)
+            w = (1.0 + (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) / cutoff_rad**2) ** -2
+            turn += w * d
+            total += w
+        mean = product(rotation(turn / total), mean)
+    return mean
+
+
+@njit(cache=True, nogil=True)
 def cholesky_in_place(A: Float) -> bool:
     """Lower factor of a symmetric matrix, read from and written to its lower triangle; False if not definite."""
     for j in range(A.shape[0]):

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from hat_ros import lie
 from hat_ros.config import FeatureSlamConfig
 from hat_ros.render.embree import RayCaster
+from hat_ros.slam.linear import robust_mean_rotation
 from hat_ros.slam.window import Window
 from hat_ros.target import Target
 from hat_ros.types import PosePrior
@@ -93,9 +94,9 @@ class SurfacePrior:
         uv = xn[:, None] + _CROSS_PX / focal
         rays = np.concatenate([uv, np.ones((*uv.shape[:2], 1))], axis=-1).reshape(-1, 3) @ T_cam_target[:3, :3]
         origin = -T_cam_target[:3, 3] @ T_cam_target[:3, :3]
-        face, z, _ = self._caster.cast(np.broadcast_to(origin, rays.shape), rays)
-        z = z.astype(np.float64).reshape(-1, len(_CROSS_PX))
-        hit = (face >= 0).reshape(z.shape)
+        hits = self._caster.trace(np.broadcast_to(origin, rays.shape), rays)
+        z = hits["tfar"].astype(np.float64).reshape(-1, len(_CROSS_PX))
+        hit = (hits["primID"] >= 0).reshape(z.shape)
         spread = np.where(hit, z, -np.inf).max(axis=1) - np.where(hit, z, np.inf).min(axis=1)
         known = hit[:, 0] & (np.count_nonzero(hit, axis=1) >= _MIN_HITS)
         return np.where(known, z[:, 0], np.nan), self._sigma_m + 0.5 * np.where(known, spread, 0.0)
@@ -130,19 +131,6 @@ class SurfacePrior:
         if len(frames) < _MIN_ROTATIONS:
             return
         R_cam_target = np.stack([self._rotation[window.stamps_ns[k]] for k in frames])
-        R_target_slam = robust_mean_rotation(np.swapaxes(R_cam_target, 1, 2) @ window.R[frames])
+        R_target_slam = robust_mean_rotation(np.swapaxes(R_cam_target, 1, 2) @ window.R[frames], _GAUGE_CUTOFF_RAD)
         window.R_fused[frames] = R_cam_target @ R_target_slam
         window.fused_info[frames] = np.radians(self._config.prior_turn_sigma_deg) ** -2
-
-
-def robust_mean_rotation(R: Float) -> Float:
-    """Mean of (n, 3, 3) rotations that outliers do not move: from the medoid, reweighted chordal means."""
-    flat = R.reshape(len(R), 9)
-    # The squared chordal distance 3 - tr(A B^T) is the squared angle, for small ones.
-    apart_sq = 3.0 - flat @ flat.T
-    mean = R[int(np.argmin(np.minimum(apart_sq, (3 * _GAUGE_CUTOFF_RAD) ** 2).sum(axis=1)))]
-    for _ in range(3):
-        weight = (1.0 + (3.0 - flat @ mean.reshape(9)) / _GAUGE_CUTOFF_RAD**2) ** -2
-        u, _, vt = np.linalg.svd(np.einsum("n,nij->ij", weight, R))
-        mean = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    return mean

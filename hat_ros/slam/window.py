@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hat_ros import lie
 from hat_ros.config import FeatureSlamConfig
 from hat_ros.slam.bundle import Problem, adjust_window, window_cost
-from hat_ros.slam.linear import turn_between
+from hat_ros.slam.linear import robust_mean_rotation, turn_between
 from hat_ros.slam.reprojection import refine_pose
 
 Float = NDArray[np.float64]
@@ -181,9 +181,10 @@ class Window:
             self._remove(1 + int(np.argmin(gap)))
 
     def _remove(self, k: int) -> None:
-        del self.stamps_ns[k], self.number[k]
+        keep = np.arange(len(self)) != k
         for name in ("R", "t", "xn", "seen", "R_fused", "fused_info", "R_emitted"):
-            setattr(self, name, np.delete(getattr(self, name), k, axis=0))
+            setattr(self, name, getattr(self, name)[keep])
+        del self.stamps_ns[k], self.number[k]
 
     def adjust(self) -> None:
         """Bundle-adjust the window; while it is young, from a wide loss to a narrow one."""
@@ -292,10 +293,9 @@ class Window:
         """One-sigma angle of the turn from the last frame but one to the last; infinite while nothing is known."""
         if not np.isfinite(self.covariance).all():
             return float("inf")
-        A = self.R[-1] @ self.R[-2].T
-        J = np.zeros((3, 12))
-        J[:, :3], J[:, 6:9] = -A, np.eye(3)
-        return float(np.sqrt(np.trace(J @ self.covariance @ J.T)))
+        # Of d_1 - A d_0, where A turns one frame's errors into the other's: the trace needs no product but one.
+        A, C = self.R[-1] @ self.R[-2].T, self.covariance
+        return float(np.sqrt(np.trace(C[:3, :3]) + np.trace(C[6:9, 6:9]) - 2.0 * np.sum(A * C[6:9, :3])))
 
     def _poses_for(self, X: Float, known: Bool, first: int) -> tuple[Float, Float]:
         """Poses (W, 3, 3), (W, 3) of all frames from other points (N, 3), those that are known.
@@ -331,7 +331,7 @@ class Window:
 
     def _problem(self, with_prior: bool) -> Problem:
         seconds = (np.array(self.stamps_ns, dtype=np.int64) - self.stamps_ns[0]) * 1e-9
-        dt = np.diff(seconds, prepend=-1.0)
+        dt = np.concatenate([[1.0], seconds[1:] - seconds[:-1]])
         rate_info = np.zeros((len(self), 2))
         span = 0.5 * (dt[1:-1] + dt[2:])
         rate_info[1:-1] = (self._acceleration * span[:, None]) ** -2
@@ -370,3 +370,4 @@ def rehearse(config: FeatureSlamConfig) -> None:
     window.adjust()
     window.challenge_prior()
     window.emit()
+    robust_mean_rotation(window.R, 1.0)

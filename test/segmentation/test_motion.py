@@ -31,7 +31,7 @@ def frames(count=9, drift=0.7, spin=0.08, target=True):
 
 
 def evidence(pictures):
-    detector = MotionDetector()
+    detector = MotionDetector(max(SIDE))
     for picture in pictures:
         detector.push(picture)
     return detector.evidence()
@@ -67,7 +67,7 @@ def test_when_everything_changes_motion_says_nothing():
 
 
 def test_a_change_of_size_starts_afresh():
-    detector = MotionDetector()
+    detector = MotionDetector(max(SIDE))
     for picture in frames()[0]:
         detector.push(picture)
     detector.push(np.zeros((60, 80, 3), np.uint8))
