@@ -4,6 +4,9 @@ Each view keeps its silhouette on a polar grid about its own centroid, scaled by
 transformed over the polar angle, so that turning the camera about its axis is a multiplication by a phase; and a
 sparse set of contour points in 3-D, from which a pose can be refined without rendering. Built once per model in about
 two seconds and kept in the platform's cache folder.
+
+Booms and antennas are left out of both sides of the comparison: they have much outline and little area, a mask rarely
+shows them, and contour points on them would drag a pose towards a part of the mask that they do not belong to.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from hat_ros.target import Target
 from hat_ros.types import Camera
 
 # Raised whenever the content of a bank changes its meaning: older cache files are then not found.
-_FORMAT = 1
+_FORMAT = 2
 N_RINGS = 32
 # Outer radius of the polar grid in radii of gyration: the far end of a lopsided slender body lies at about 2.5.
 MAX_RADIUS = 2.6
@@ -29,6 +32,10 @@ CONTOUR_POINTS = 96
 # Distance of the virtual camera in bounding radii: far enough that perspective matters little, near enough to be real.
 _DISTANCE_RADII = 8.0
 _RENDER_PX = 112
+# Parts of a silhouette narrower than about twice this share of its longer side are thin, unless this much of its area
+# is: then it is a thin body that is seen.
+_THIN_SHARE = 0.013
+_THIN_BODY_SHARE = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,16 +94,31 @@ def build(target: Target, renderer: Renderer, n_views: int, n_angles: int) -> Vi
         view = renderer.render(T, camera, color=False)
         if not view.mask.any():  # a flat body seen exactly edge-on
             continue
-        center_px, gyration_px = mask_moments(view.mask)
-        rings[i] = polar_grid(view.mask.astype(np.float32), center_px, gyration_px, n_angles)
+        body = without_thin_parts(view.mask)
+        center_px, gyration_px = mask_moments(body)
+        rings[i] = polar_grid(body.astype(np.float32), center_px, gyration_px, n_angles)
         gyration[i] = gyration_px / focal
         centroid[i] = (center_px - K[:2, 2]) / focal
-        table = contour_table(view.depth_m, view.mask, K, CONTOUR_POINTS)
+        table = contour_table(view.depth_m, body, K, CONTOUR_POINTS)
         contour[i, : len(table)] = (table[:, :3] - T[:3, 3]) @ R
         weight[i, : len(table)] = table[:, COL_WEIGHT]
     spectrum = np.ascontiguousarray(np.fft.rfft(rings, axis=1).transpose(1, 0, 2).astype(np.complex64))
     area = (rings @ ring_weights()).sum(axis=1)
     return ViewBank(rotations, spectrum, area, gyration, centroid, contour, weight, np.array(distance))
+
+
+def without_thin_parts(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """A silhouette (H, W) with at least one pixel, its booms and antennas left out: what banks are compared by."""
+    silhouette = np.ascontiguousarray(mask).view(np.uint8)
+    x, y, width, height = cv2.boundingRect(silhouette)
+    radius = round(_THIN_SHARE * max(width, height))
+    if radius == 0:
+        return mask
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    part = np.s_[y : y + height, x : x + width]
+    body = np.zeros_like(mask)
+    body[part] = cv2.morphologyEx(silhouette[part], cv2.MORPH_OPEN, kernel) > 0
+    return body if np.count_nonzero(body) >= (1.0 - _THIN_BODY_SHARE) * np.count_nonzero(mask) else mask
 
 
 def mask_moments(mask: NDArray[np.bool_]) -> tuple[NDArray[np.float64], float]:

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from hat_ros import lie
 from hat_ros.config import HatConfig
 from hat_ros.errors import ConfigError
-from hat_ros.hypotheses.bank import ViewBank, load_or_build
+from hat_ros.hypotheses.bank import ViewBank, load_or_build, without_thin_parts
 from hat_ros.hypotheses.box import silhouette_in_box
 from hat_ros.hypotheses.lit_bank import load_or_build_lit
 from hat_ros.hypotheses.matching import (
@@ -133,8 +133,9 @@ class TemplateHypotheses:
             starts.append(Start(self._fitter.centred(prior.T_cam_target, frame.camera, field, scorer.luma)))
             if prior.healthy:
                 n_coarse = max(1, n_coarse // _TRACKED_DIVISOR)
-        placements = whole_placement(mask)
-        aligned = self._align(starts + self._coarse(placements, frame, field, n_coarse), frame, scorer)
+        body = without_thin_parts(mask)
+        placements = whole_placement(body)
+        aligned = self._align(starts + self._coarse(body, placements, frame, field, n_coarse), frame, scorer)
         best = max(aligned, key=lambda a: a.score, default=None)
         # Light will find what lies in shadow; without a prior both ways are tried.
         relies_on_light = scorer.dark_around and prior is not None
@@ -142,9 +143,9 @@ class TemplateHypotheses:
         if best is None or not (explained or relies_on_light):
             # The mask is not the whole silhouette: look for those that it may be a part of.
             cut = detection.touches_border()
-            placements = cut_placements(mask) if cut else partial_placements(mask)
+            placements = cut_placements(body) if cut else partial_placements(body)
             n_coarse = n_usual
-            aligned += self._align(self._coarse(placements, frame, field, n_coarse), frame, scorer)
+            aligned += self._align(self._coarse(body, placements, frame, field, n_coarse), frame, scorer)
         selected = self._select(aligned, self._max_candidates)
         scored = self._finish(selected, frame, scorer)
         leader = max(scored, key=lambda pair: pair[1], default=None)
@@ -153,7 +154,7 @@ class TemplateHypotheses:
             lit = self._align(self._sunlit(starts + self._coarse_lit(frame, scorer), frame, scorer), frame, scorer)
             scored += self._finish(lit, frame, scorer)
         elif not self._is_clear(scored, prior):
-            further = self._coarse(placements, frame, field, _MORE_COARSE * n_usual, n_coarse)
+            further = self._coarse(body, placements, frame, field, _MORE_COARSE * n_usual, n_coarse)
             aligned += self._align(further, frame, scorer)
             more = self._select(aligned, 2 * self._max_candidates)
             scored += self._finish([start for start in more if start not in selected], frame, scorer)
@@ -168,13 +169,19 @@ class TemplateHypotheses:
         """Nothing to forget: every keyframe stands for itself."""
 
     def _coarse(
-        self, placements: list[Placement], frame: Frame, field: MaskField, n_coarse: int, n_known: int = 0
+        self,
+        body: NDArray[np.bool_],
+        placements: list[Placement],
+        frame: Frame,
+        field: MaskField,
+        n_coarse: int,
+        n_known: int = 0,
     ) -> list[Start]:
         """The best shape matches after those that are known already, pulled onto the mask's boundary."""
         options = self._options
         matches = match_shape(
             self._bank,
-            field.mask,
+            body,
             placements,
             frame.camera,
             n_coarse,

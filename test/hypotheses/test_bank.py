@@ -81,3 +81,36 @@ def test_the_border_grid_is_that_of_ones():
     for center in ((80.0, 60.0), (3.0, 100.0)):
         inside = bank.border_grid(ones.shape, np.array(center), 30.0, 24)
         np.testing.assert_allclose(inside, bank.polar_grid(ones, np.array(center), 30.0, 24), atol=0.06)
+
+
+def _body_and_boom(scale, boom_px):
+    """A body of 60 x 40 pixels, and a boom of some width three times as far out; both magnified."""
+    mask = np.zeros((120 * scale, 200 * scale), np.bool_)
+    mask[40 * scale : 80 * scale, 20 * scale : 80 * scale] = True
+    with_boom = mask.copy()
+    with_boom[60 * scale : 60 * scale + boom_px, 80 * scale : 180 * scale] = True
+    return mask, with_boom
+
+
+@pytest.mark.parametrize("scale", [1, 3])
+def test_a_boom_is_left_out_at_any_magnification(scale):
+    mask, with_boom = _body_and_boom(scale, boom_px=2 * scale)
+    np.testing.assert_array_equal(bank.without_thin_parts(with_boom)[:, 85 * scale :], False)
+    kept = bank.without_thin_parts(with_boom) & mask
+    assert kept.sum() > 0.98 * mask.sum()
+
+
+def test_what_is_as_wide_as_a_panel_is_kept_and_so_is_a_body_that_is_thin_all_over():
+    panel = _body_and_boom(1, boom_px=12)[1]
+    assert bank.without_thin_parts(panel).sum() > 0.97 * panel.sum()
+    edge_on = np.zeros((120, 200), np.bool_)
+    edge_on[60:62, 20:180] = True
+    np.testing.assert_array_equal(bank.without_thin_parts(edge_on), edge_on)
+
+
+def test_a_mask_without_the_boom_has_the_moments_of_the_view_with_it():
+    mask, with_boom = _body_and_boom(1, boom_px=2)
+    seen, shown = (bank.mask_moments(bank.without_thin_parts(m)) for m in (mask, with_boom))
+    np.testing.assert_allclose(shown[0], seen[0], atol=0.5)
+    assert shown[1] == pytest.approx(seen[1], rel=0.02)
+    assert bank.mask_moments(with_boom)[1] > 1.2 * seen[1]  # so much the boom would have changed it
