@@ -20,7 +20,6 @@ import numpy as np
 from hat_ros.core.sync import Admission
 from hat_ros.errors import FrameError
 from hat_ros.methods import Method
-from hat_ros.segmentation.masks import overlap
 from hat_ros.tracker import Step
 from hat_ros.turnstile import Turnstiles
 from hat_ros.types import Frame
@@ -33,7 +32,6 @@ MEASURED = (
     "decode_ms",
     *(f"{name}_ms" for name in STAGE_NAMES),
     "rss_mib",
-    "mask_iou",
 )
 # First frames left out of throughput and latency: compiled code is loaded and caches are filled there.
 WARMUP_FRAMES = 10
@@ -44,24 +42,20 @@ class Processed:
     """One admitted frame and what came of it.
 
     Attributes:
-        frame: the frame as recorded, given mask included.
         step: what the stages said.
         latency_ms: wall time from admission to the answer, waiting behind frames in flight included.
         decode_ms: wall time of reading and decoding the frame before that, beside earlier frames.
         stage_ms: wall time by stage, waiting left out.
         rss_mib: resident memory of this process after the step.
-        mask_iou: overlap of the detected and the recorded silhouette, NaN when none was recorded.
         period_ms: wall time from the previous answer, or the start, to this one.
         cpu_ms: processor time of the whole process in that period.
     """
 
-    frame: Frame
     step: Step
     latency_ms: float
     decode_ms: float
     stage_ms: dict[str, float]
     rss_mib: float
-    mask_iou: float
     period_ms: float = float("nan")
     cpu_ms: float = float("nan")
 
@@ -74,7 +68,6 @@ class Processed:
             self.decode_ms,
             *self.stage_ms.values(),
             self.rss_mib,
-            self.mask_iou,
         )
 
 
@@ -83,13 +76,11 @@ class Pipeline:
 
     Args:
         method: what estimates the poses.
-        masks_given: hand the recorded masks to the method; otherwise they only serve to judge its own.
         credits: W, frames in flight at once, each in a thread; the answers do not depend on it.
     """
 
-    def __init__(self, method: Method, masks_given: bool, credits: int = 1) -> None:
+    def __init__(self, method: Method, credits: int = 1) -> None:
         self._method = method
-        self._masks_given = masks_given
         self._credits = credits if method.concurrent else 1
         self._turnstiles = Turnstiles(method.stages)
         self._admission = Admission(self._credits)
@@ -123,7 +114,7 @@ class Pipeline:
                 fill()
                 while in_flight:
                     done = in_flight.popleft().result()
-                    self._admission.answered(done.frame.stamp_ns)
+                    self._admission.answered(done.step.estimate.stamp_ns)
                     answer = replace(done, **clock.lap())
                     fill()  # now: what the caller does with the answer takes its time
                     yield answer
@@ -149,16 +140,12 @@ class Pipeline:
             yield seq, frame, decode_ms
 
     def _process(self, seq: int, frame: Frame, decode_ms: float) -> Processed:
-        seen = frame if self._masks_given else replace(frame, given_mask=None)
         start = time.perf_counter()
         with self._turnstiles.frame(seq) as stage_ms:
-            step = self._method.step(seen)
-        latency_ms, iou = 1e3 * (time.perf_counter() - start), float("nan")
-        looked = step.detection is not None or "segmentation" in stage_ms
-        if looked and frame.given_mask is not None and (silhouette := frame.given_mask == 255).any():
-            iou = 0.0 if step.detection is None else overlap(step.detection.mask, silhouette)
+            step = self._method.step(frame)
+        latency_ms = 1e3 * (time.perf_counter() - start)
         stage_ms = {name: stage_ms.get(name, 0.0) for name in STAGE_NAMES}
-        return Processed(frame, step, latency_ms, decode_ms, stage_ms, resident_mib(), iou)
+        return Processed(step, latency_ms, decode_ms, stage_ms, resident_mib())
 
 
 class _ReadAhead:

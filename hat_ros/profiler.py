@@ -10,7 +10,7 @@ from __future__ import annotations
 import resource
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import wraps
 from importlib import import_module
 from types import TracebackType
@@ -273,10 +273,10 @@ def profile(source: Source, config: HatConfig, limit: int | None = None, watch: 
     mark = time.perf_counter()
     with Meter(parts_of(config), wait) as meter:
         tracker = HatTracker(config, source.target)
-        for frame in source.frames(0, limit):
+        for frame in source.frames(0, limit, given):
             if not isinstance(frame, Frame):
                 continue
-            step = tracker.step(frame if given else replace(frame, given_mask=None))
+            step = tracker.step(frame)
             before, mark = mark, time.perf_counter()
             done.append(_Metered(len(step.candidates) > 0, mark - before, meter.take()))
             if watch is not None:

@@ -3,7 +3,8 @@
 bag/            result bag: all /hat topics except images, /target_pose, the truth if known
 poses.tum       stamp x y z qx qy qz qw of every published T_cam_target
 poses.csv       every admitted frame: stamp, state, pose, errors
-frames.csv      every admitted frame: latency, time per stage, mask overlap (what the run measured)
+frames.csv      every admitted frame: latency, time per stage (what the run measured)
+masks.csv       frames with a recorded silhouette: overlap of the detected one with it
 config.yaml     the configuration as used
 run.json        where it came from: command, commit, versions, input hashes
 metrics.json    figures (DESIGN section 6)
@@ -17,7 +18,7 @@ import csv
 import json
 import math
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -113,6 +114,13 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def write_overlaps(path: Path, overlaps: Mapping[int, float]) -> None:
+    """Write mask overlaps by stamp; nothing where there are none."""
+    if overlaps:
+        lines = [f"{stamp_ns},{overlap:.4f}\n" for stamp_ns, overlap in overlaps.items()]
+        (path / "masks.csv").write_text("".join(("stamp_ns,iou\n", *lines)), encoding="utf-8")
 
 
 class LiveTables:

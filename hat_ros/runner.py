@@ -17,11 +17,12 @@ from hat_ros.config import HatConfig
 from hat_ros.errors import HatError, MissingDependencyError, RunError, UsageError
 from hat_ros.evaluation.folder import complete_folder
 from hat_ros.evaluation.metrics import mask_summary
+from hat_ros.evaluation.silhouettes import Silhouettes
 from hat_ros.methods import create_method
 from hat_ros.pipeline import MEASURED, WARMUP_FRAMES, Pipeline, latency_summary, memory_summary
 from hat_ros.provenance import describe_run
 from hat_ros.result_bag import ResultBagWriter, read_stage_ms
-from hat_ros.results import RUN_FILE, LiveTables, ResultFolder, write_config, write_json
+from hat_ros.results import RUN_FILE, LiveTables, ResultFolder, write_config, write_json, write_overlaps
 from hat_ros.source import Source, SourceSpec
 from hat_ros.tracker import Step
 from hat_ros.types import TrackState
@@ -87,10 +88,10 @@ def track(spec: SourceSpec, out: Path, config: HatConfig, options: TrackOptions,
     method = create_method(options.mode, config, source.target)
     masks_given = config.segmentation.backend in GIVEN_MASK_BACKENDS
     credits = options.credits or min(DEFAULT_CREDITS, config.graph.credits_replay)
-    pipeline = Pipeline(method, masks_given, credits)
+    pipeline = Pipeline(method, credits)
     how = {"mode": options.mode, "start": options.start, "limit": options.limit}
     with _result_folder(folder, spec, config, how):
-        measured = _run(pipeline, source, folder, options, watch)
+        measured = _run(pipeline, source, folder, options, masks_given, watch)
         complete_folder(folder.path, source, measured, video=options.video, report=options.report)
     return folder.final_path
 
@@ -219,19 +220,27 @@ def _result_folder(folder: ResultFolder, spec: SourceSpec, config: HatConfig, ho
 
 
 def _run(
-    pipeline: Pipeline, source: Source, folder: ResultFolder, options: TrackOptions, watch: Watcher | None
+    pipeline: Pipeline,
+    source: Source,
+    folder: ResultFolder,
+    options: TrackOptions,
+    masks_given: bool,
+    watch: Watcher | None,
 ) -> dict[str, Any]:
     """Process all frames, write bag and live tables, return what was measured."""
     rows: list[tuple[float, ...]] = []
     steps: list[Step] = []
+    silhouettes = Silhouettes()
     total = source.count(options.start, options.limit)
     with (
         closing(LiveTables(folder.path, MEASURED)) as tables,
         ResultBagWriter(folder.bag_path, source.frame_id, source.target.name) as bag,
     ):
         try:
-            for done in pipeline.run(source.frames(options.start, options.limit)):
+            for done in pipeline.run(source.frames(options.start, options.limit, masks_given)):
                 rows.append(done.measured())
+                if done.stage_ms["segmentation"] > 0.0:
+                    silhouettes.remember(done.step)
                 if pipeline.causal:
                     tables.add(done.step.estimate, rows[-1])
                     bag.write_step(done.step, pipeline.rejected)
@@ -250,6 +259,7 @@ def _run(
     if not rows:
         raise RunError(f"no frame of {source.path} could be used, {pipeline.rejected} were rejected (stamp or image)")
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    overlap = np.array([row[MEASURED.index("mask_iou")] for row in rows])
+    overlaps = silhouettes.overlaps(source.masks(options.start, options.limit))
+    write_overlaps(folder.path, overlaps)
     speed, memory = latency_summary(rows, finish_s), {"peak_memory_mib": peak_mib} | memory_summary(rows)
-    return speed | memory | mask_summary(overlap)
+    return speed | memory | mask_summary(np.array(list(overlaps.values())))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hat_ros import lie
-from hat_ros.bag import BagReader, deserialize
+from hat_ros.bag import BagReader, Packet, deserialize
 from hat_ros.datasets.image_files import ImageRecording
 from hat_ros.datasets.importer import open_dataset, with_annotation_boxes, with_detections
 from hat_ros.datasets.sequence import load_sequence
@@ -107,11 +108,21 @@ class Source:
     recording: ImageRecording | BagReader
     target: Target
 
-    def frames(self, start: int = 0, limit: int | None = None) -> Iterator[Frame | FrameError]:
-        """Frames from number ``start`` on, at most ``limit`` of them; a malformed one comes as its error."""
-        stop = None if limit is None else start + limit
-        attempts = _attempts(self.recording) if isinstance(self.recording, BagReader) else self.recording.frames(stop)
-        return islice(attempts, start, stop)
+    def frames(self, start: int = 0, limit: int | None = None, masks: bool = True) -> Iterator[Frame | FrameError]:
+        """Frames from number ``start`` on, at most ``limit`` of them; a malformed one comes as its error.
+
+        ``masks``: with the recorded ones.
+        """
+        stop, recording = None if limit is None else start + limit, self.recording
+        bag = isinstance(recording, BagReader)
+        return islice(_attempts(recording, masks) if bag else recording.frames(stop, masks), start, stop)
+
+    def masks(self, start: int = 0, limit: int | None = None) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+        """Stamps and recorded masks of the same frames, images left alone."""
+        recording, stop = self.recording, None if limit is None else start + limit
+        if isinstance(recording, BagReader):
+            return islice(_masks(recording), start, stop)
+        return ((item.stamp_ns, recording.given_mask(item)) for item in recording.files[start:stop])
 
     def count(self, start: int = 0, limit: int | None = None) -> int:
         """How many frames :meth:`frames` brings."""
@@ -130,16 +141,28 @@ class Source:
         return {stamp: lie.row_from_matrix(T) for stamp, T in self.recording.truth().items()}
 
 
-def _attempts(bag: BagReader) -> Iterator[Frame | FrameError]:
+def _attempts(bag: BagReader, masks: bool) -> Iterator[Frame | FrameError]:
     """The frames of a bag; one that cannot be decoded does not end the stream."""
     for packet in bag.packets():
         kind = f"sensor_msgs/msg/{'CompressedImage' if packet.compressed else 'Image'}"
         try:
             rgb = decode_image(deserialize(packet.image, kind, bag.path))
-            mask = packet.mask and decode_mask(deserialize(packet.mask, "sensor_msgs/msg/Image", bag.path))
-            yield Frame(packet.stamp_ns, rgb, bag.camera, mask)
+            yield Frame(packet.stamp_ns, rgb, bag.camera, _mask_of(packet, bag) if masks else None)
         except FrameError as error:
             yield error
+
+
+def _masks(bag: BagReader) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+    """Stamps and masks of a bag; one that cannot be decoded says nothing."""
+    for packet in bag.packets():
+        mask = None
+        with suppress(FrameError):
+            mask = _mask_of(packet, bag)
+        yield packet.stamp_ns, mask
+
+
+def _mask_of(packet: Packet, bag: BagReader) -> NDArray[np.uint8] | None:
+    return packet.mask and decode_mask(deserialize(packet.mask, "sensor_msgs/msg/Image", bag.path))
 
 
 def open_source(path: str | Path, detections: Path | None = None) -> Source:

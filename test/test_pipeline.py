@@ -4,7 +4,7 @@ import threading
 
 import numpy as np
 import pytest
-from scripted import CAMERA, ScriptedMethod, frame, mask, stamp
+from scripted import CAMERA, ScriptedMethod, frame, stamp
 
 from hat_ros.bag import BagWriter
 from hat_ros.datasets.models import write_model
@@ -20,9 +20,9 @@ from hat_ros.pipeline import (
 from hat_ros.source import open_source
 
 
-def run(frames, masks_given=False):
+def run(frames):
     method = ScriptedMethod()
-    pipeline = Pipeline(method, masks_given)
+    pipeline = Pipeline(method)
     return list(pipeline.run(frames)), pipeline, method
 
 
@@ -50,19 +50,6 @@ def test_stamp_that_is_no_time_is_rejected(bad_stamp):
     assert (len(done), pipeline.rejected) == (1, 1)
 
 
-def test_recorded_masks_reach_the_method_only_when_given():
-    given = np.where(mask(), 255, 0).astype(np.uint8)
-    for masks_given in (False, True):
-        done, _, method = run([frame(0, given)], masks_given)
-        assert (method.seen[0].given_mask is not None) == masks_given
-        assert done[0].mask_iou == 1.0, "they judge the method's own masks either way"
-
-
-def test_box_masks_are_no_silhouette_to_judge_by():
-    done, _, _ = run([frame(0, np.full((48, 64), 128, np.uint8))])
-    assert np.isnan(done[0].mask_iou)
-
-
 def test_frames_are_read_by_one_thread_and_an_error_of_reading_ends_the_run():
     threads = set()
 
@@ -77,12 +64,12 @@ def test_frames_are_read_by_one_thread_and_an_error_of_reading_ends_the_run():
 
     done = []
     with pytest.raises(BagError, match="breaks off"):
-        for answer in Pipeline(ScriptedMethod(), masks_given=False, credits=2).run(recording()):
-            done.append(answer.frame.stamp_ns)
+        for answer in Pipeline(ScriptedMethod(), credits=2).run(recording()):
+            done.append(answer.step.estimate.stamp_ns)
     assert done == [stamp(i) for i in range(3)]
     assert len(threads) == 1
     threads.clear()
-    abandoned = Pipeline(ScriptedMethod(), masks_given=False).run(recording())
+    abandoned = Pipeline(ScriptedMethod()).run(recording())
     next(abandoned)
     abandoned.close()
     assert len(threads) == 1, "closed by the thread that read it"
@@ -138,7 +125,7 @@ def test_bag_is_a_source_and_a_broken_image_does_not_end_it(bag):
     assert source.target.name == "cubesat"
     assert sorted(source.truth_rows()) == [stamp(i) for i in range(4)]
     done, pipeline, _ = run(source.frames())
-    assert [d.frame.stamp_ns for d in done] == [stamp(i) for i in (0, 1, 2, 3, 5)]
+    assert [d.step.estimate.stamp_ns for d in done] == [stamp(i) for i in (0, 1, 2, 3, 5)]
     assert pipeline.rejected == 1
 
 

@@ -124,3 +124,6 @@ def test_shirt_regions_come_from_its_labels(tmp_path):
     source = SourceSpec(root, "shirt", "roe1_synthetic", tmp_path / "cubesat.glb").open()
     (frame,) = source.frames()
     assert set(np.unique(frame.given_mask)) == {0, 128}
+    assert next(source.frames(masks=False)).given_mask is None
+    ((stamp_ns, mask),) = source.masks()
+    assert stamp_ns == frame.stamp_ns and np.array_equal(mask, frame.given_mask)

@@ -62,7 +62,7 @@ class ThreeStages(ScriptedMethod):
 @pytest.mark.parametrize("seed", range(3))
 def test_each_stage_sees_the_frames_one_by_one_in_order(credits, seed):
     method = ThreeStages(seed)
-    done = list(Pipeline(method, False, credits).run(frame(i) for i in range(20)))
+    done = list(Pipeline(method, credits).run(frame(i) for i in range(20)))
     assert [d.step.estimate.stamp_ns for d in done] == [stamp(i) for i in range(20)]
     assert method.before_first == list(range(20))
     assert method.stages["segmentation"].seen == method.stages["motion"].seen == list(range(20))
@@ -75,7 +75,7 @@ def test_each_stage_sees_the_frames_one_by_one_in_order(credits, seed):
 def test_a_method_that_follows_its_own_last_answer_gets_one_frame_at_a_time():
     method = ThreeStages()
     method.concurrent = False
-    list(Pipeline(method, False, 4).run(frame(i) for i in range(10)))
+    list(Pipeline(method, 4).run(frame(i) for i in range(10)))
     assert method.most_at_once == 1
 
 
@@ -84,7 +84,7 @@ def test_frames_before_one_that_fails_are_answered_and_its_error_is_the_one_seen
     method = ThreeStages(fails_at=7)
     answered = []
     with pytest.raises(RunError, match="frame 7 broke"):
-        for done in Pipeline(method, False, credits).run(frame(i) for i in range(20)):
+        for done in Pipeline(method, credits).run(frame(i) for i in range(20)):
             answered.append(done.step.estimate.stamp_ns)
     assert answered == [stamp(i) for i in range(7)]
     assert method.stages["motion"].seen == list(range(7))
@@ -92,7 +92,7 @@ def test_frames_before_one_that_fails_are_answered_and_its_error_is_the_one_seen
 
 def test_who_stops_listening_stops_the_threads():
     before = threading.active_count()
-    run = Pipeline(ThreeStages(), False, 4).run(frame(i) for i in range(1000))
+    run = Pipeline(ThreeStages(), 4).run(frame(i) for i in range(1000))
     next(run)
     run.close()
     assert threading.active_count() == before
@@ -116,7 +116,7 @@ def test_poses_do_not_depend_on_the_frames_in_flight():
     runs = {}
     for credits in (1, 4):
         method = create_method("hat", config, target)
-        runs[credits] = [done.step for done in Pipeline(method, False, credits).run(frames)]
+        runs[credits] = [done.step for done in Pipeline(method, credits).run(frames)]
     for alone, among in zip(runs[1], runs[4], strict=True):
         assert alone.estimate.pose_row.tobytes() == among.estimate.pose_row.tobytes()
         assert alone.estimate.covariance.tobytes() == among.estimate.covariance.tobytes()

@@ -71,19 +71,19 @@ class ImageRecording:
     def __len__(self) -> int:
         return len(self.files)
 
-    def frames(self, limit: int | None = None) -> Iterator[Frame]:
-        """Decoded frames in order.
+    def frames(self, limit: int | None = None, masks: bool = True) -> Iterator[Frame]:
+        """Decoded frames in order, with or without what is known of the target's place in them.
 
         Raises:
             DatasetError: a file is missing, cannot be decoded, or has another size than the calibration says.
         """
         for item in self.files[:limit]:
-            yield self.frame(item)
+            yield self.frame(item, masks)
 
-    def frame(self, item: ImageFile) -> Frame:
+    def frame(self, item: ImageFile, mask: bool = True) -> Frame:
         """Decode one frame; errors as in :meth:`frames`."""
         rgb = self._rectify(read_rgb(item.image), item.image, cv2.INTER_LINEAR)
-        return Frame(item.stamp_ns, rgb, self.camera, self.given_mask(item))
+        return Frame(item.stamp_ns, rgb, self.camera, self.given_mask(item) if mask else None)
 
     def given_mask(self, item: ImageFile) -> NDArray[np.uint8] | None:
         """(H, W) uint8 as in ``Frame.given_mask``, None when the frame brings no detection at all."""
@@ -94,7 +94,7 @@ class ImageRecording:
             inside = np.zeros((self.camera.height, self.camera.width), bool)
             for path in item.masks:
                 inside |= self._rectify(_read(path, cv2.IMREAD_GRAYSCALE), path, cv2.INTER_NEAREST) > 127
-            return np.where(inside, np.uint8(255), np.uint8(0))
+            return inside.astype(np.uint8) * np.uint8(255)
         if item.box_xyxy is not None:
             mask = np.zeros((self.camera.height, self.camera.width), np.uint8)
             x0, y0 = np.clip(np.ceil(item.box_xyxy[:2]), 0, None).astype(int)
