@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hat_ros.segmentation.masks import Mask, enlarge
-from hat_ros.segmentation.sky import SKY_MAX, Sky
+from hat_ros.segmentation.sky import SKY_MAX, Sky, level_and_noise
 
 _WIDTHS_PX = (5, 9, 17)
 _NOISE_SIGMAS = 4.0
@@ -96,21 +96,21 @@ def _noise(image: NDArray[np.uint8], width: int, factor: int) -> tuple[int, floa
     r = factor * (2 * n + 8)
     if min(image.shape) < 3 * r:
         return None
-    inner = slice(n // 2, -(n // 2) or None, n)
     strips = (image[:r], image[-r:], image[r:-r, :r], image[r:-r, -r:])
-    means = [cv2.boxFilter(_reduced(strip, factor), -1, (n, n))[inner, inner].ravel() for strip in strips]
-    values = np.concatenate(means)
+    values = np.concatenate([_reduced(strip, factor * n, whole=True).ravel() for strip in strips])
     values = values[values < SKY_MAX]
     if len(values) < 8:
         return None
-    level = float(np.median(values))
-    sigma = 1.4826 * float(np.median(np.abs(values - level)))
+    level, sigma = level_and_noise(values)
     return n, level, max(_NOISE_SIGMAS * sigma, _MIN_STEP)
 
 
-def _reduced(image: NDArray[np.uint8] | NDArray[np.float32], factor: int) -> NDArray[np.float32]:
-    """Means of ``factor`` x ``factor`` pixels."""
+def _reduced(image: NDArray[np.uint8] | NDArray[np.float32], factor: int, whole: bool = False) -> NDArray[np.float32]:
+    """Means of ``factor`` x ``factor`` pixels; ``whole`` ones only, what is left at the far sides dropped."""
     size = (-(-image.shape[1] // factor), -(-image.shape[0] // factor))
+    if whole:
+        size = (image.shape[1] // factor, image.shape[0] // factor)
+        image = image[: size[1] * factor, : size[0] * factor]
     image = image.astype(np.float32, copy=False)
     return image if factor == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 

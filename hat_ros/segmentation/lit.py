@@ -114,7 +114,10 @@ def _explains(silhouette: Mask, lit: Mask, body: Mask) -> bool:
 
 def _shadowed(silhouette: Mask, lit: Mask) -> Mask:
     """The dark parts of a silhouette: what is not lit, without the slivers that a slightly wrong pose leaves."""
-    _, _, w, h = cv2.boundingRect(silhouette)
+    x, y, w, h = cv2.boundingRect(silhouette)
     radius = max(2, round(0.02 * max(w, h)))
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    return cv2.morphologyEx(silhouette & (1 - lit), cv2.MORPH_OPEN, kernel)
+    box = np.s_[max(0, y - radius) : y + h + radius, max(0, x - radius) : x + w + radius]
+    out = np.zeros_like(silhouette)
+    out[box] = cv2.morphologyEx(silhouette[box] & (1 - lit[box]), cv2.MORPH_OPEN, kernel)
+    return out

@@ -59,19 +59,29 @@ def measure_sky(rgb: NDArray[np.uint8]) -> Sky:
     """Level and noise of the sky from the image border: (H, W, 3) uint8."""
     luma = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     around = cv2.dilate(luma, _NEIGHBOURS)
-    hot = cv2.findNonZero(cv2.threshold(cv2.subtract(luma, around), _HOT_EXCESS, 1, cv2.THRESH_BINARY)[1])
-    if hot is not None:
-        cols, rows = hot[:, 0].T
-        luma[rows, cols] = around[rows, cols]
+    hot = cv2.threshold(cv2.subtract(luma, around), _HOT_EXCESS, 1, cv2.THRESH_BINARY)[1]
+    cv2.copyTo(around, hot, luma)
     mean3 = cv2.boxFilter(luma, cv2.CV_32F, (3, 3))
     ring = np.concatenate([mean3[strip].ravel() for strip in _border(luma.shape)])
     dark = ring[_dark_border(rgb)]
     if dark.size < 8:
         return Sky(luma, mean3, 0.0, 0.0, 0.0)
-    level = float(np.median(dark))
-    sigma = 1.4826 * float(np.median(np.abs(dark - level)))
+    level, sigma = level_and_noise(dark)
     threshold = level + max(_NOISE_SIGMAS * sigma, _MIN_STEP)
     return Sky(luma, mean3, level, threshold, float(np.count_nonzero(dark <= threshold)) / ring.size)
+
+
+def level_and_noise(values: NDArray[np.float32]) -> tuple[float, float]:
+    """Median of (n,) values and their standard deviation about it, without those that lie far off."""
+    level = _median(values)
+    return level, 1.4826 * _median(np.abs(values - level))
+
+
+def _median(values: NDArray[np.float32]) -> float:
+    """``np.median`` without most of its overhead."""
+    half = len(values) // 2
+    low = half - 1 + len(values) % 2
+    return float(np.partition(values, (low, half))[low : half + 1].mean())
 
 
 def dark_border_share(rgb: NDArray[np.uint8]) -> float:
