@@ -184,7 +184,7 @@ def backtrace(candidates: Sequence[Candidates], motions: Sequence[Motion], confi
         if keyframes:
             last = keyframes[-1]
             penalty = motion_penalty(
-                candidates[last], alive[-1], motions[last], group, survivors, motions[frame], config
+                candidates[last], alive[-1], motions[last], group, survivors, motions[frame], frame - last, config
             )
             history = score[None, :] - penalty
             pointers.append(np.argmax(history, axis=1))

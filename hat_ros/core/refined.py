@@ -9,9 +9,10 @@ At keyframes the selected anchor competes with the track:
 
 * Within D of the track it is one basin, and the anchor one more start for the refinement: the best result wins.
 * Beyond D it is a rival. Successive rivals that follow from each other (the paper's coherence) add up, and so does
-  their lead in image evidence over the track. A rival takes over once it is supported and leads by
-  ``arbitration_margin``, or once as many coherent rivals stand against the track as anchors clearly stood for it
-  (``reset_anchors`` at most, as in the paper), unless the image speaks against them by that margin.
+  their lead in image evidence over the track. A rival takes over once it is supported, leads by ``arbitration_margin``
+  and is the decoder's clear choice, if anchors stood for the track; or once as many coherent rivals stand against the
+  track as anchors clearly stood for it (``reset_anchors`` at most, as in the paper), unless the image speaks against
+  them by that margin.
 
 With no refinement supported, the output is what the paper's fusion makes of prediction and anchor, and it coasts. A
 supported output is called TRACKING only if it is beyond doubt as well (``core.confidence``): the image is certain, or a
@@ -85,7 +86,8 @@ class RefinedFusion:
     ) -> Fused:
         """Advance by one frame; arguments as :meth:`CausalFusion.update`, beside the image.
 
-        ``decided``: the decoder prefers the anchor's basin clearly. An anchor that barely won speaks for no track.
+        ``decided``: the decoder prefers the anchor's basin clearly. An anchor that barely won speaks for no track, nor
+        does it alone overthrow one.
         """
         if motion.epoch != self._epoch:
             self._epoch = motion.epoch
@@ -128,7 +130,7 @@ class RefinedFusion:
             self._n_agreed = self._n_agreed + decided if close else 0
             self._n_disagreed = 0
             return self._agree(frame, detection, track, predicted, anchor, confidence)
-        return self._arbitrate(frame, detection, track, predicted, anchor)
+        return self._arbitrate(frame, detection, track, predicted, anchor, decided)
 
     def _known_of(self, predicted: Float) -> RotationPrior:
         """What the track says of its rotation now."""
@@ -162,9 +164,19 @@ class RefinedFusion:
         return replace(self._outcome(best, otherwise, predicted), gate_weight=1.0)
 
     def _arbitrate(
-        self, frame: Frame, detection: Detection | None, track: Refined | None, predicted: Float, anchor: Float
+        self,
+        frame: Frame,
+        detection: Detection | None,
+        track: Refined | None,
+        predicted: Float,
+        anchor: Float,
+        decided: bool,
     ) -> Fused:
-        """Anchor and track stand in different basins: weigh the evidence so far."""
+        """Anchor and track stand in different basins: weigh the evidence so far.
+
+        Against a track that others have spoken for, one anchor that barely won is not enough, however much the mask,
+        which both were compared with, prefers it.
+        """
         self._n_disagreed += 1
         rival = self._best_refined(frame, detection, [anchor])
         lead = quality(rival) - quality(track)
@@ -172,6 +184,7 @@ class RefinedFusion:
         needed = min(self._n_agreed + 1, self._alignment_config.reset_anchors)
         margin = self._refinement.arbitration_margin
         clearly_better = self._lead >= margin and is_supported(rival, self._refinement)
+        clearly_better &= decided or self._n_agreed == 0
         outnumbers = self._dissent.count >= needed and self._lead > -margin
         if not (clearly_better or outnumbers):
             return replace(self._outcome(track, predicted, predicted), gate_weight=self._fusion.gate_weight)

@@ -29,6 +29,7 @@ class SelectorStage:
     def reset(self) -> None:
         """Forget all orientation histories; the next keyframe is the first."""
         self._previous: tuple[Candidates, NDArray[np.intp], Float, Motion] | None = None
+        self._n_frames_since = 0
         self._n_keyframes = 0
         self._gate = RunningGate(self._config)
         self.accepted = False
@@ -45,6 +46,7 @@ class SelectorStage:
             not advance.
         """
         self.accepted = False
+        self._n_frames_since += 1
         if len(candidates) == 0:
             return Selection.none()
         scaled = scaled_score(candidates, self._config)
@@ -56,7 +58,7 @@ class SelectorStage:
         path[alive] = scaled[alive] + self._best_history(candidates, alive, motion)
         # Only differences matter (eq. viterbi): keeping the largest at zero keeps precision over any length.
         path -= path.max()
-        self._previous = (candidates, alive, path[alive], motion)
+        self._previous, self._n_frames_since = (candidates, alive, path[alive], motion), 0
         self._n_keyframes += 1
 
         proposal, best = int(np.argmax(path)), int(np.argmax(scaled))
@@ -69,7 +71,9 @@ class SelectorStage:
         if self._previous is None:
             return np.zeros(len(alive))
         previous, previous_alive, previous_path, previous_motion = self._previous
-        penalty = motion_penalty(previous, previous_alive, previous_motion, candidates, alive, motion, self._config)
+        penalty = motion_penalty(
+            previous, previous_alive, previous_motion, candidates, alive, motion, self._n_frames_since, self._config
+        )
         return np.max(previous_path[None, :] - penalty, axis=1)
 
 
@@ -80,19 +84,24 @@ def motion_penalty(
     current: Candidates,
     current_alive: NDArray[np.intp],
     current_motion: Motion,
+    n_frames: int,
     config: SelectorConfig,
 ) -> Float:
-    """mu d(R_{j,k}, Delta R_{j-1,h}) between the survivors of two keyframes: (k, h), zero without an increment.
+    """mu d(R_{j,k}, Delta R_{j-1,h}) between the survivors of two keyframes, ``n_frames`` apart: (k, h).
 
-    Our extension: at most ``max_motion_penalty``, if that is set. The published penalty takes it for granted that the
-    true orientation was among the earlier candidates; where it was not, no evidence could ever make up for half a turn.
+    Our extensions, both off as published: the penalty is at most ``max_motion_penalty``, since the true orientation
+    need not have been among the earlier candidates, and then no evidence could ever make up for half a turn. And it is
+    not zero without an increment, which would forget all history: there a turn counts as far as it exceeds
+    ``max_turn_deg_per_frame``.
     """
-    increment = rotation_increment(previous_motion, current_motion)
+    increment, free_deg = rotation_increment(previous_motion, current_motion), 0.0
     if increment is None:
-        return np.zeros((len(current_alive), len(previous_alive)))
+        if config.max_turn_deg_per_frame == 0:
+            return np.zeros((len(current_alive), len(previous_alive)))
+        increment, free_deg = np.eye(3), config.max_turn_deg_per_frame * n_frames
     predicted = increment @ previous.T_cam_target[previous_alive, :3, :3]
     angle = lie.angle_between(current.T_cam_target[current_alive, None, :3, :3], predicted[None])
-    penalty = config.motion_weight_per_deg * np.degrees(angle)
+    penalty = config.motion_weight_per_deg * np.maximum(np.degrees(angle) - free_deg, 0.0)
     return np.minimum(penalty, config.max_motion_penalty) if config.max_motion_penalty > 0 else penalty
 
 

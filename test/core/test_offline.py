@@ -32,7 +32,9 @@ def test_the_path_is_the_best_of_all_paths(seed):
     def total(path):
         score = sum(scaled_score(candidates[i], config)[k] for i, k in zip(keys, path, strict=True))
         for (i, a), (j, b) in zip(zip(keys, path, strict=True), list(zip(keys, path, strict=True))[1:], strict=False):
-            score -= motion_penalty(candidates[i], every, motions[i], candidates[j], every, motions[j], config)[b, a]
+            score -= motion_penalty(candidates[i], every, motions[i], candidates[j], every, motions[j], j - i, config)[
+                b, a
+            ]
         return score
 
     best = max(product(range(3), repeat=len(keys)), key=total)

@@ -126,6 +126,17 @@ def test_a_locked_wrong_basin_is_left_when_the_image_prefers_the_anchor(scene):
     assert (errors[56:] < 1e-5).all()
 
 
+@pytest.mark.parametrize(("lead", "left"), [(1.0, 64), (6.0, 56)])
+def test_a_track_that_anchors_stood_for_is_not_left_for_one_that_barely_won(scene, lead, left):
+    """Whatever the image prefers; two such anchors outnumber the one that stood for the track."""
+    stage = _stage(scene)
+    _run(stage, scene, range(16), lambda i, T: _flipped(T))
+    _run(stage, scene, range(16, 56), lambda i, T: None)
+    frames = range(56, 80)
+    errors = _errors(_run(stage, scene, frames, lead=lead), scene, frames)
+    assert 56 + int(np.argmax(errors < 90)) == left
+
+
 def test_equal_evidence_leaves_the_decision_to_four_coherent_anchors(scene):
     def equal(index):
         return {"true": (0.9, 0.9), "flipped": (0.9, 0.9)}

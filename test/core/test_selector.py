@@ -7,7 +7,7 @@ import pytest
 
 from hat_ros import lie
 from hat_ros.config import SelectorConfig
-from hat_ros.core.selector import RunningGate, SelectorStage, rotation_increment, scaled_score
+from hat_ros.core.selector import RunningGate, SelectorStage, motion_penalty, rotation_increment, scaled_score
 from hat_ros.types import Candidates, Motion
 
 FREE = SelectorConfig(warmup_keyframes=1)
@@ -89,6 +89,43 @@ def test_an_orientation_missing_at_first_wins_once_evidence_exceeds_the_limit():
     published = _run(keyframes, SelectorConfig(score_scale=1.0))
     assert [s.selected for s in limited[3:]] == [0] * 5 + [1] * 3
     assert all(s.selected == 0 for s in published)
+
+
+def _half_a_turn_apart(turned_deg=0.0):
+    """Two candidates, half a turn apart, both turned by an angle since the start."""
+    R = lie.so3_exp(np.radians(turned_deg) * np.array([0.0, 0.0, 1.0]))
+    return lie.row_from_matrix(lie.transform(np.stack([R, R @ lie.so3_exp(np.array([np.pi, 0, 0]))]), np.zeros((2, 3))))
+
+
+def test_where_motion_is_missing_no_history_is_forgotten():
+    still, none = Candidates(_half_a_turn_apart(), np.array([5.0, 0.0])), Motion.none()
+    later = Candidates(_half_a_turn_apart(), np.array([0.0, 3.0]))
+    limit = {"score_scale": 1.0, "max_motion_penalty": 8.0}
+    assert [s.selected for s in _run([(still, none), (later, none)], SelectorConfig(**limit))] == [0, 1]
+    kept = _run([(still, none), (later, none)], SelectorConfig(**limit, max_turn_deg_per_frame=5.0))
+    assert [s.selected for s in kept] == [0, 0]
+    assert kept[1].path_score[1] == pytest.approx(-2.0)  # 5 less 3, as if the motion were known to be none
+
+
+@pytest.mark.parametrize(("n_frames", "penalty"), [(1, 0.3 * 25.0), (3, 0.3 * 15.0), (6, 0.0)])
+def test_a_turn_that_the_time_allows_costs_nothing_where_motion_is_missing(n_frames, penalty):
+    config = SelectorConfig(max_motion_penalty=8.0, max_turn_deg_per_frame=5.0)
+    before, after = (Candidates(_half_a_turn_apart(turned)[:1], np.zeros(1)) for turned in (0.0, 30.0))
+    one, none = np.array([0]), Motion.none()
+    found = motion_penalty(before, one, none, after, one, none, n_frames, config)
+    np.testing.assert_allclose(found, [[penalty]], atol=1e-9)
+
+
+def test_frames_without_candidates_count_as_time_gone_by():
+    config = SelectorConfig(score_scale=1.0, max_motion_penalty=8.0, max_turn_deg_per_frame=5.0)
+    before = Candidates(_half_a_turn_apart(), np.array([6.0, 0.0]))
+    after = Candidates(_half_a_turn_apart(90.0), np.array([0.0, 1.0]))
+    lead = []
+    for n_frames in (1, 20):
+        none = [(Candidates.none(), Motion.none())] * (n_frames - 1)
+        path = _run([(before, Motion.none()), *none, (after, Motion.none())], config)[-1].path_score
+        lead.append(path[0] - path[1])
+    assert lead == pytest.approx([-1.0, 5.0])  # at once a quarter turn is as unlikely as any; in time it is none
 
 
 @pytest.mark.parametrize("seed", range(4))
