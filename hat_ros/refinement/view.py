@@ -22,7 +22,7 @@ from hat_ros.refinement.contour import (
     contour_table,
 )
 from hat_ros.render.embree import RayCaster
-from hat_ros.render.outline import Hits, Rays, cast_outlined
+from hat_ros.render.outline import Hits, Outlined, Rays, cast_outlined
 from hat_ros.target import Target
 from hat_ros.types import Camera
 
@@ -54,6 +54,7 @@ class View:
         origin_px: (2,) image position of the crop's pixel (0, 0).
         scale: crop pixels per image pixel.
         T_cam_target: (4, 4) pose that it shows.
+        seen: the rays that found it and what they hit, in the target frame.
         lit: (h, w) bool part of the silhouette that the sun shines on; None when no sun is known.
     """
 
@@ -63,6 +64,7 @@ class View:
     origin_px: NDArray[np.float64]
     scale: float
     T_cam_target: NDArray[np.float64]
+    seen: Outlined
     lit: NDArray[np.bool_] | None = None
 
     def shifted(self, shift_px: NDArray[np.float64]) -> View:
@@ -132,8 +134,20 @@ class TargetViewer:
         K[:2, 2] -= origin
         K[:2] *= scale
         crop = Camera(K, int(width + width % 2), int(height + height % 2))
-        mask, depth, lit = self._cast(T_cam_target, crop, to_sun_cam)
-        return View(mask, depth, crop, origin, scale, T_cam_target, lit)
+        R, t = T_cam_target[:3, :3], T_cam_target[:3, 3]
+        to_ray = np.ascontiguousarray((R.T @ np.linalg.inv(crop.K)).T)  # rays in the target frame: affine in the pixel
+        seen = cast_outlined(self._caster.trace, crop.width, crop.height, to_ray, -t @ R)
+        view = View(seen.mask, seen.depth_m, crop, origin, scale, T_cam_target, seen)
+        return view if to_sun_cam is None else self.in_sunlight(view, to_sun_cam)
+
+    def in_sunlight(self, view: View, to_sun_cam: NDArray[np.float64]) -> View:
+        """The same view, and what of it a sun shines on: direction (3,) to it in the camera frame, any length."""
+        seen = view.seen
+        to_sun = (to_sun_cam / np.linalg.norm(to_sun_cam) @ view.T_cam_target[:3, :3]).astype(np.float32)
+        sunlit = self._sunlit_hits(*seen.grid, to_sun).reshape(view.mask.shape[0] // 2, view.mask.shape[1] // 2)
+        lit = np.repeat(np.repeat(sunlit, 2, axis=0), 2, axis=1)
+        lit[seen.y, seen.x] = self._sunlit_hits(*seen.scattered, to_sun)
+        return replace(view, lit=lit)
 
     def bounds(self, T_cam_target: NDArray[np.float64], camera: Camera) -> NDArray[np.float64] | None:
         """Image box (x0, y0, x1, y1) around the target, None when it is not in front of the camera."""
@@ -148,7 +162,16 @@ class TargetViewer:
         directions = directions.astype(np.float32)
         origins = np.empty_like(directions)
         origins[:] = origin_m
-        hits = self._caster.trace(origins, directions)
+        return self._surfels((origins, directions), self._caster.trace(origins, directions))
+
+    def surfels(self, view: View, rays: NDArray[np.intp]) -> Surfels:
+        """What some of a view's grid of rays see: (N,) which, row by row of every second pixel of the crop."""
+        (origins, directions), hits = view.seen.grid
+        chosen = {name: hits[name][rays] for name in ("primID", "u", "v", "tfar")}
+        return self._surfels((origins[rays], directions[rays]), chosen)
+
+    def _surfels(self, rays: Rays, hits: Hits) -> Surfels:
+        origins, directions = rays
         at = np.flatnonzero(hits["primID"] >= 0)
         face_id, u, v = hits["primID"][at], hits["u"][at], hits["v"][at]
         directions = directions[at]
@@ -156,22 +179,6 @@ class TargetViewer:
         normals[np.einsum("nk,nk->n", normals, directions) > 0] *= np.float32(-1)
         rgb = self.target.surface.sample(face_id, np.stack([1.0 - u - v, u, v], axis=-1), self.target.face_rgb)
         return Surfels(at, face_id, origins[at] + directions * hits["tfar"][at, None], directions, normals, rgb)
-
-    def _cast(
-        self, T_cam_target: NDArray[np.float64], crop: Camera, to_sun_cam: NDArray[np.float64] | None
-    ) -> tuple[NDArray[np.bool_], NDArray[np.float32], NDArray[np.bool_] | None]:
-        """Silhouette, depth near its outline, and what of it is sunlit if there is a sun, all (h, w)."""
-        R, t = T_cam_target[:3, :3], T_cam_target[:3, 3]
-        to_ray = np.ascontiguousarray((R.T @ np.linalg.inv(crop.K)).T)  # rays in the target frame: affine in the pixel
-        origin = -t @ R
-        to_sun = None if to_sun_cam is None else (to_sun_cam / np.linalg.norm(to_sun_cam) @ R).astype(np.float32)
-        seen = cast_outlined(self._caster.trace, crop.width, crop.height, to_ray, origin)
-        lit = None
-        if to_sun is not None:
-            sunlit = self._sunlit_hits(*seen.grid, to_sun).reshape(crop.height // 2, crop.width // 2)
-            lit = np.repeat(np.repeat(sunlit, 2, axis=0), 2, axis=1)
-            lit[seen.y, seen.x] = self._sunlit_hits(*seen.scattered, to_sun)
-        return seen.mask, seen.depth_m, lit
 
     def _sunlit_hits(self, rays: Rays, hits: Hits, to_sun: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Which of the rays (N,) hit something that the sun shines on."""
@@ -258,10 +265,8 @@ class MaskField:
         self.mask = mask
         pixels = mask.view(np.uint8)
         left, top, width, height = cv2.boundingRect(pixels)
-        moments = cv2.moments(pixels[top : top + height, left : left + width], binaryImage=True)
-        self.area_px = moments["m00"]
+        self.area_px = float(cv2.countNonZero(pixels))
         self.size_px = float(max(width, height))
-        self.centroid_px = np.array([left + moments["m10"] / self.area_px, top + moments["m01"] / self.area_px])
         margin = int(max(_MIN_MARGIN_PX, _MARGIN_SHARE * self.size_px))
         # Beyond the image border nothing is known: the border pixels continue, so that a cut is no contour.
         y0, y1 = max(top - margin, -margin), min(top + height + margin, mask.shape[0] + margin)
@@ -271,13 +276,23 @@ class MaskField:
         beyond = (max(-y0, 0), max(y1 - mask.shape[0], 0), max(-x0, 0), max(x1 - mask.shape[1], 0))
         crop = cv2.copyMakeBorder(inside, *beyond, cv2.BORDER_REPLICATE)
         self._beyond = beyond
-        outward = cv2.distanceTransform(1 - crop, cv2.DIST_L2, 5)
-        inward = cv2.distanceTransform(crop, cv2.DIST_L2, 5) if not crop.all() else np.full_like(outward, 1e3 + 0.5)
-        # One of the two is zero. A boundary lies half a pixel from the centres on either side of it.
-        distance = outward - inward
+        distance = cv2.distanceTransform(1 - crop, cv2.DIST_L2, 5)
+        # Inwards where the mask is; with two pixels around it nothing outside can be nearer.
+        left, top, width, height = cv2.boundingRect(crop)
+        box = np.s_[max(0, top - 2) : top + height + 2, max(0, left - 2) : left + width + 2]
+        distance[box] -= cv2.distanceTransform(crop[box], cv2.DIST_L2, 5) if not crop.all() else np.float32(1e3 + 0.5)
+        # A boundary lies half a pixel from the centres on either side of it.
         distance += crop
         distance -= np.float32(0.5)
         self.distance = cv2.GaussianBlur(distance, (0, 0), 1.0)
+
+    @cached_property
+    def centroid_px(self) -> NDArray[np.float64]:
+        """(2,) centre of gravity."""
+        pixels = self.mask.view(np.uint8)
+        left, top, width, height = cv2.boundingRect(pixels)
+        moments = cv2.moments(pixels[top : top + height, left : left + width], binaryImage=True)
+        return np.array([left + moments["m10"] / self.area_px, top + moments["m01"] / self.area_px])
 
     @cached_property
     def _depth_counts(self) -> NDArray[np.intp]:

@@ -141,12 +141,12 @@ def _trim_outline(region: NDArray[np.uint8], luma: NDArray[np.uint8], sky: Sky) 
     """Take off what blur and the 3 x 3 mean added around the outline."""
     region = fill_holes(region, _HOLE_SHARE)
     inner = cv2.erode(region, _K5, borderType=cv2.BORDER_REPLICATE)
-    rows, cols = np.nonzero(region != inner)
-    excess = luma[rows, cols] - sky.level
-    peak = cv2.dilate(luma, _K5)[rows, cols] - sky.level
+    at = np.flatnonzero(region != inner)
+    excess = luma.ravel()[at] - sky.level
+    peak = cv2.dilate(luma, _K5).ravel()[at] - sky.level
     # Where the step is within the noise of a single pixel the mean decides, which already chose the region.
     faint = peak < _FAINT_STEPS * (sky.threshold - sky.level)
-    inner[rows, cols] = (excess >= _EDGE_SHARE * peak) | faint
+    inner.ravel()[at] = (excess >= _EDGE_SHARE * peak) | faint
     return inner
 
 
