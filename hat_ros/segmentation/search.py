@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -133,10 +134,7 @@ class Search:
             return found
         whole = self._newest.window
         motion = self._newest.motion
-        cuts = [region.cut_from_nothing(whole.rgb)]
-        if motion is not None:
-            cuts.append(region.cut_from_motion(whole.rgb, motion.moving))
-        cuts += [region.cut_from_nothing(whole.rgb, side, cuts[0]) for side in open_sides]
+        cuts = _cold_cuts(whole.rgb, motion, open_sides)
         # Without motion an open side may let the background in: the first, closed cut is the safest.
         margin = OPEN_BETTER if motion is None else 0.0
         best, best_score = None, -np.inf
@@ -244,6 +242,21 @@ class Search:
             return required
         # So does most of the background, and nothing has spoken against it before it has moved.
         return required + (CUT_SURCHARGE if motion is not None else _UNMOVED_SURCHARGE)
+
+
+def _cold_cuts(rgb: NDArray[np.uint8], motion: MotionEvidence | None, open_sides: tuple[str, ...]) -> list[Mask | None]:
+    """The closed cut, the one from motion if there is any, and one for each open side, two at a time.
+
+    A search takes as long as all other frames of a second: it must not hold up the next frame for longer than it has
+    to. Each cut seeds the generator of its own thread, so which runs where does not matter.
+    """
+    with ThreadPoolExecutor(2) as pool:
+        cuts = [pool.submit(region.cut_from_nothing, rgb)]
+        if motion is not None:
+            cuts.append(pool.submit(region.cut_from_motion, rgb, motion.moving))
+        closed = cuts[0].result()
+        cuts += [pool.submit(region.cut_from_nothing, rgb, side, closed) for side in open_sides]
+        return [cut.result() for cut in cuts]
 
 
 def margin_px(mask: Mask) -> float:
