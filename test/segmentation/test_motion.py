@@ -76,3 +76,11 @@ def test_a_change_of_size_starts_afresh():
 
 def test_pictures_too_small_to_compare_say_nothing():
     assert evidence([picture[:10, :12] for picture in frames()[0]]) is None
+
+
+def test_large_pictures_are_reduced_to_the_size_that_is_searched():
+    pictures, _ = frames()
+    large = [cv2.resize(picture, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST) for picture in pictures]
+    found = evidence(large)
+    assert found.moving.shape == SIDE
+    np.testing.assert_array_equal(found.moving, evidence(pictures).moving)

@@ -8,7 +8,7 @@ from speckled_clip import CAMERA, FRAME_NS, speckled_clip, turn_errors_deg
 
 from hat_ros import lie
 from hat_ros.config import FeatureSlamConfig, HatConfig, PriorConfig, SlamConfig
-from hat_ros.slam.feature import FeatureSlam, bulge
+from hat_ros.slam.feature import FeatureSlam, bulge, depth_beside
 from hat_ros.slam.linear import turn_between
 from hat_ros.types import Camera, Detection, Frame
 
@@ -238,3 +238,12 @@ def test_bulge_is_highest_in_the_middle_and_low_at_the_edge():
     assert height[0] > height[2] > height[1]
     assert (height >= 0).all()
     assert (height <= 1).all()
+
+
+def test_new_points_start_at_the_depth_of_the_nearest_known_ones():
+    xy_known = np.random.default_rng(4).uniform(0, 100, (60, 2))
+    z_known = np.where(xy_known[:, 0] < 50, 1.0, 3.0)
+    z, relief = depth_beside(np.array([[20.0, 50.0], [80.0, 50.0], xy_known[0]]), xy_known, z_known)
+    np.testing.assert_allclose(z[:2], [1.0, 3.0])
+    assert relief >= 0.0
+    assert depth_beside(np.zeros((1, 2)), np.ones((2, 2)), np.array([2.0, 4.0]))[0] == pytest.approx(3.0)
