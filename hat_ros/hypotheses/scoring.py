@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hat_ros.refinement.refiner import Fit
+from hat_ros.refinement.sunlight import LightField
 from hat_ros.refinement.view import VISIBLE_LEVEL, MaskField, TargetViewer, View
 from hat_ros.types import Frame
 
@@ -63,6 +64,7 @@ class Scorer:
         self._viewer = viewer
         self._frame = frame
         self.field = field
+        self.light_field = LightField(frame.rgb, field.mask)
         self._render_px = render_px
         self.luma = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         self.dark_around = self._is_dark_around()
@@ -91,13 +93,14 @@ class Scorer:
         outline = max(outline_px, 1.0)
         return areas.extra / outline, areas.missing / outline, areas.hidden / outline
 
-    def evidence(self, fit: Fit, to_sun_cam: NDArray[np.float64] | None = None) -> Evidence | None:
-        """Gather the evidence for a refined pose, or for its part that a sun shines on; None when it cannot be seen."""
-        view: View | None = fit.view.shifted(fit.shift_px)
-        if fit.twist_px > _SAME_VIEW_PX:
-            view = self._viewer.view(fit.T_cam_target, self._frame.camera, self._render_px, to_sun_cam)
-        if view is None:
-            return None
+    def view(self, fit: Fit, to_sun_cam: NDArray[np.float64] | None = None) -> View | None:
+        """What a refined pose looks like, or its part that a sun shines on; None when it cannot be seen."""
+        if fit.twist_px <= _SAME_VIEW_PX:
+            return fit.view.shifted(fit.shift_px)
+        return self._viewer.view(fit.T_cam_target, self._frame.camera, self._render_px, to_sun_cam)
+
+    def evidence(self, fit: Fit, view: View) -> Evidence | None:
+        """Gather the evidence for a refined pose that looks like a view; None when it cannot be seen."""
         length = fit.lines[:, 2] * (fit.contour[:, 0] > 0)
         total = fit.outline_px
         if total <= 0:

@@ -70,6 +70,8 @@ _POOR_SCORE = -6.0
 _LIGHT_MATTERS = 14.0
 # With a healthy prior among the starts, fewer matches: they are there to contradict it, not to find the target.
 _TRACKED_DIVISOR = 2
+# With any prior, fewer matches of brightness: the light that suits the prior itself finds as much as most of them.
+_AIDED_LIT_DIVISOR = 4
 # A lead in log-likelihood that ends the search; without one, so many times the usual shape matches are tried.
 _CLEAR_LEAD = 6.0
 _MORE_COARSE = 3
@@ -80,18 +82,18 @@ _LAST = Schedule((0, 4, 3.5, 3), (1, 2, 1.5, 1.5), (3, 2, 1.5, 1.5))
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
-    """Where refinement begins: (4, 4) pose, and the direction to the sun (3,) if the mask is only what is lit."""
+class Aligned:
+    """A start after the first refinement.
+
+    Attributes:
+        T_cam_target: (4, 4) pose.
+        to_sun_cam: direction to the sun (3,) if the mask is only what is lit.
+        score: its shape score.
+    """
 
     T_cam_target: NDArray[np.float64]
-    to_sun_cam: NDArray[np.float64] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Aligned(Start):
-    """A start after the first refinement, with its shape score."""
-
-    score: float = -np.inf
+    to_sun_cam: NDArray[np.float64] | None
+    score: float
 
 
 class TemplateHypotheses:
@@ -117,7 +119,7 @@ class TemplateHypotheses:
         self._viewer = TargetViewer(target)
         self._fitter = PoseFitter(self._viewer, options.render_px, _CONTOUR_POINTS)
         self._sun = SunMatcher(self._viewer)
-        self._lit_bank = load_or_build_lit(self._viewer, options.n_angles)
+        self._lit_bank = load_or_build_lit(self._viewer, options.n_angles // 2)
         self._bank = load_or_build(target, create_renderer("embree", target), options.n_views, options.n_angles)
 
     def generate(self, frame: Frame, detection: Detection, prior: PosePrior | None) -> Candidates:
@@ -130,10 +132,11 @@ class TemplateHypotheses:
         starts = []
         n_coarse = n_usual = self._options.n_coarse * (_UNAIDED_FACTOR if prior is None else 1)
         if prior is not None:
-            starts.append(Start(self._fitter.centred(prior.T_cam_target, frame.camera, field, scorer.luma)))
+            starts.append(self._fitter.centred(prior.T_cam_target, frame.camera, field, scorer.luma))
             if prior.healthy:
                 n_coarse = max(1, n_coarse // _TRACKED_DIVISOR)
-        body = without_thin_parts(mask)
+        # Before a dark sky a thin strip may be all that is lit.
+        body = mask if scorer.dark_around else without_thin_parts(mask)
         placements = whole_placement(body)
         aligned = self._align(starts + self._coarse(body, placements, frame, field, n_coarse), frame, scorer)
         best = max(aligned, key=lambda a: a.score, default=None)
@@ -151,7 +154,9 @@ class TemplateHypotheses:
         leader = max(scored, key=lambda pair: pair[1], default=None)
         if scorer.dark_around and (leader is None or not self._confirms(leader[0], prior)):
             # What lies in shadow is missing from the mask: compare what is bright.
-            lit = self._align(self._sunlit(starts + self._coarse_lit(frame, scorer), frame, scorer), frame, scorer)
+            n_lit = self._options.n_coarse_lit
+            n_lit = n_lit if prior is None else max(1, n_lit // _AIDED_LIT_DIVISOR)
+            lit = self._align(starts + self._coarse_lit(n_lit, frame, scorer), frame, scorer, in_sunlight=True)
             scored += self._finish(lit, frame, scorer)
         elif not self._is_clear(scored, prior):
             further = self._coarse(body, placements, frame, field, _MORE_COARSE * n_usual, n_coarse)
@@ -176,7 +181,7 @@ class TemplateHypotheses:
         field: MaskField,
         n_coarse: int,
         n_known: int = 0,
-    ) -> list[Start]:
+    ) -> list[NDArray[np.float64]]:
         """The best shape matches after those that are known already, pulled onto the mask's boundary."""
         options = self._options
         matches = match_shape(
@@ -189,22 +194,15 @@ class TemplateHypotheses:
             self._target.center_m,
         )
         further = ShapeMatches(matches.T_cam_target[n_known:], matches.view[n_known:], matches.score[n_known:])
-        return [Start(T) for T in self._pulled(self._bank, further, frame, field)]
+        return self._pulled(self._bank, further, frame, field)
 
-    def _coarse_lit(self, frame: Frame, scorer: Scorer) -> list[Start]:
+    def _coarse_lit(self, n_lit: int, frame: Frame, scorer: Scorer) -> list[NDArray[np.float64]]:
         """The best matches of brightness."""
         light, options = scorer.light(), self._options
         if light is None:
             return []
-        matches = match_light(
-            self._lit_bank, light, frame.camera, options.n_coarse_lit, options.separation_deg, self._target.center_m
-        )
-        return [Start(T) for T in matches.T_cam_target]
-
-    def _sunlit(self, starts: list[Start], frame: Frame, scorer: Scorer) -> list[Start]:
-        """The same starts in the sunlight that suits them."""
-        suns = [self._sun.match(start.T_cam_target, frame, scorer.field.mask) for start in starts]
-        return [Start(a.T_cam_target, b.to_sun_cam) for a, b in zip(starts, suns, strict=True) if b is not None]
+        matches = match_light(self._lit_bank, light, frame.camera, n_lit, options.separation_deg, self._target.center_m)
+        return list(matches.T_cam_target)
 
     def _pulled(
         self, bank: ViewBank, matches: ShapeMatches, frame: Frame, field: MaskField
@@ -223,16 +221,22 @@ class TemplateHypotheses:
         n_kept = max(1, int(np.ceil(_REFINED_SHARE * len(pulled))))
         return [pulled[i] for i in np.argsort(distance_px, kind="stable")[:n_kept]]
 
-    def _align(self, starts: list[Start], frame: Frame, scorer: Scorer) -> list[Aligned]:
-        """Refine on the mask with rendered contours, and compare shapes."""
+    def _align(
+        self, starts: list[NDArray[np.float64]], frame: Frame, scorer: Scorer, in_sunlight: bool = False
+    ) -> list[Aligned]:
+        """Refine on the mask with rendered contours, or with what of them is sunlit, and compare shapes."""
         out = []
-        for start in starts:
-            view = self._viewer.view(start.T_cam_target, frame.camera, self._options.render_px, start.to_sun_cam)
+        for T in starts:
+            view, to_sun = self._viewer.view(T, frame.camera, self._options.render_px), None
+            if view is not None and in_sunlight:
+                sunlight = self._sun.match(view, scorer.light_field)
+                to_sun = None if sunlight is None else sunlight.to_sun_cam
+                view = None if to_sun is None else self._viewer.in_sunlight(view, to_sun)
             if view is None:
                 continue
-            fit = self._fitter.iterate(start.T_cam_target, view, frame.camera, frame.rgb, scorer.field, _FIRST)
+            fit = self._fitter.iterate(T, view, frame.camera, frame.rgb, scorer.field, _FIRST)
             score = shape_score(*scorer.mismatch(view, fit.outline_px, _SELECTION_TOLERANCE_PX))
-            out.append(Aligned(fit.T_cam_target, start.to_sun_cam, score))
+            out.append(Aligned(fit.T_cam_target, to_sun, score))
         return out
 
     def _select(self, aligned: list[Aligned], n_best: int) -> list[Aligned]:
@@ -264,19 +268,21 @@ class TemplateHypotheses:
 
         Sunlight is fitted to those that it could still make the best; the others are given the worst of these fits.
         """
-        poses, scores = [], []
+        poses, views, scores = [], [], []
         for start in starts:
             fit = self._fitter.fit(
                 start.T_cam_target, frame.camera, frame.rgb, scorer.field, (_LAST,), to_sun_cam=start.to_sun_cam
             )
-            evidence = None if fit is None else scorer.evidence(fit, start.to_sun_cam)
-            if fit is not None and evidence is not None:
+            view = None if fit is None else scorer.view(fit, start.to_sun_cam)
+            evidence = None if fit is None or view is None else scorer.evidence(fit, view)
+            if evidence is not None:
                 poses.append(fit.T_cam_target)
+                views.append(view)
                 scores.append(log_score(evidence))
         light = np.full(len(poses), np.nan)
-        for i, T in enumerate(poses):
+        for i, view in enumerate(views):
             if scores[i] > max(scores) - _LIGHT_MATTERS:
-                sunlight = self._sun.match(T, frame, scorer.field.mask)
+                sunlight = self._sun.match(view, scorer.light_field)
                 light[i] = light_score(1.0 if sunlight is None else sunlight.distance)
         worst = np.nanmin(light) if len(poses) else 0.0
         light = np.nan_to_num(light, nan=worst)

@@ -10,7 +10,7 @@ from hat_ros import lie
 from hat_ros.config import RefinementConfig
 from hat_ros.refinement.covariance import outline_floor, outline_misfit_px, pose_covariance
 from hat_ros.refinement.refiner import WITH_MASK, WITHOUT_MASK, Fit, PoseFitter
-from hat_ros.refinement.sunlight import SunMatcher
+from hat_ros.refinement.sunlight import LightField, SunMatcher
 from hat_ros.refinement.view import MaskField, Overlap, TargetViewer, View
 from hat_ros.target import Target
 from hat_ros.types import Detection, Frame, Refined, RotationPrior
@@ -63,12 +63,15 @@ class FusedPoseRefiner:
         field = MaskField(detection.mask) if detection is not None and detection.silhouette else None
         luma = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         prior = prior or RotationPrior(T_cam_target[:3, :3], self._start_information)
-        start, fit = self._fit(frame, field, luma, T_cam_target, prior)
-        if fit is not None and field is not None and _lies_in_shadow(field.compare(fit.view, luma)):
+        start, view = self._start(frame, field, luma, T_cam_target)
+        fit = None
+        if view is not None and field is not None and _lies_in_shadow(field.compare(view, luma)):
             # Part of the silhouette cannot be seen: find out which, and fit what can.
-            sunlight = self._sun.match(start, frame, field.mask)
+            sunlight = self._sun.match(view, LightField(frame.rgb, field.mask))
             if sunlight is not None:
-                fit = self._fit_all(frame, field, start, prior, sunlight.to_sun_cam) or fit
+                lit = self._viewer.in_sunlight(view, sunlight.to_sun_cam)
+                fit = self._fit_all(frame, field, start, prior, lit, sunlight.to_sun_cam)
+        fit = fit or self._fine(frame, field, start, prior, view) or self._fit_all(frame, field, start, prior, view)
         if fit is None or not self._same_basin(start, fit.T_cam_target):
             return None
         covariance = pose_covariance(fit, self._target.bounding_radius_m)
@@ -86,23 +89,17 @@ class FusedPoseRefiner:
             lie.row_from_matrix(fit.T_cam_target), covariance, overlap, fit.support, visible_overlap, misfit_px
         )
 
-    def _fit(
-        self,
-        frame: Frame,
-        field: MaskField | None,
-        luma: NDArray[np.uint8],
-        start: NDArray[np.float64],
-        prior: RotationPrior,
-    ) -> tuple[NDArray[np.float64], Fit | None]:
-        """The finest round alone where that will do, else all rounds, centred if need be: where from, and the fit."""
-        view = self._viewer.view(start, frame.camera, self._config.render_px)
-        fit = self._fine(frame, field, start, prior, view)
-        if fit is None and field is not None:
-            centred = self._fitter.centred(start, frame.camera, field, luma, view)
-            if centred is not start:
-                start, view = centred, self._viewer.view(centred, frame.camera, self._config.render_px)
-                fit = self._fine(frame, field, start, prior, view)
-        return start, fit or self._fit_all(frame, field, start, prior, view=view)
+    def _start(
+        self, frame: Frame, field: MaskField | None, luma: NDArray[np.uint8], T_cam_target: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], View | None]:
+        """Where to start from, centred on the mask if need be, and what the target looks like there."""
+        view = self._viewer.view(T_cam_target, frame.camera, self._config.render_px)
+        if view is None or field is None:
+            return T_cam_target, view
+        start = self._fitter.centred(T_cam_target, frame.camera, field, luma, view)
+        if start is not T_cam_target:
+            view = self._viewer.view(start, frame.camera, self._config.render_px)
+        return start, view
 
     def _fine(
         self,
@@ -128,8 +125,8 @@ class FusedPoseRefiner:
         field: MaskField | None,
         start: NDArray[np.float64],
         prior: RotationPrior,
+        view: View | None,
         to_sun_cam: NDArray[np.float64] | None = None,
-        view: View | None = None,
     ) -> Fit | None:
         """All rounds, from the widest to the finest."""
         rounds = WITHOUT_MASK

@@ -15,14 +15,16 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from hat_ros.refinement.view import Surfels, TargetViewer
-from hat_ros.render.embree import pixel_rays
-from hat_ros.types import Camera, Frame
+from hat_ros.refinement.view import Surfels, TargetViewer, View
 
 Float32 = NDArray[np.float32]
 
-# Longer side of the reduced image that is compared, pixels.
-_SIDE_PX = 48
+# Points of the surface along the longer side of what is compared.
+_SIDE_POINTS = 48
+# The image is smoothed over this share of the mask's longer side: a little more than from point to point.
+_SMOOTH_SHARE = 1 / 38
+# Samples along a side of the box of the mask, of what is bright beside the silhouette.
+_SIDE_SAMPLES = 96
 # Directions of the sun tried at first, and how far behind the target they reach.
 _N_SUNS = 140
 _MAX_BEHIND = 0.75
@@ -49,14 +51,32 @@ class Sunlight:
     to_sun_cam: NDArray[np.float64]
 
 
+class LightField:
+    """What of an image is compared with shaded models.
+
+    Attributes:
+        image: (H, W, 3) uint8.
+        mask: (H, W) bool; what is bright in it beside a silhouette counts against a pose.
+        box: (x, y, width, height) of the mask.
+        smooth: (H, W, 3) uint8 image whose pixels stand for what lies between them in the comparison.
+    """
+
+    def __init__(self, image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> None:
+        self.image = image
+        self.mask = mask
+        self.box = cv2.boundingRect(mask.view(np.uint8))
+        width_px = max(1, round(_SMOOTH_SHARE * max(self.box[2:])))
+        self.smooth = cv2.blur(image, (width_px, width_px))
+
+
 @dataclass(frozen=True, eq=False)
 class _Scene:
     """What is seen where the target would be.
 
     Attributes:
-        seen: the target's surface, pixel by pixel of a reduced image.
+        seen: the target's surface, point by point.
         observed: (M, 3) colours of the image there.
-        beside: sum of what is bright in the mask beside it.
+        beside: sum of what is bright in the mask beside it, as if it were seen in points as dense.
     """
 
     seen: Surfels
@@ -73,18 +93,12 @@ class SunMatcher:
         self._suns = suns[suns[:, 2] < _MAX_BEHIND].astype(np.float32)
         self._encoded = brightness(np.linspace(0.0, 1.0, 257, dtype=np.float32))
 
-    def match(self, T_cam_target: NDArray[np.float64], frame: Frame, mask: NDArray[np.bool_]) -> Sunlight | None:
-        """The sunlight in which the target at a pose looks most like the image, None when it is out of view.
-
-        Args:
-            T_cam_target: (4, 4).
-            frame: the image.
-            mask: (H, W) bool; what is bright in it beside the silhouette counts against the pose.
-        """
-        scene = self._scene(T_cam_target, frame, mask, _SIDE_PX)
+    def match(self, view: View, field: LightField) -> Sunlight | None:
+        """The sunlight in which a view of the target looks most like the image, None when it is out of the image."""
+        scene = self._scene(view, field)
         if scene is None:
             return None
-        R, seen, albedo = T_cam_target[:3, :3], scene.seen, scene.seen.rgb.astype(np.float32)
+        R, seen, albedo = view.T_cam_target[:3, :3], scene.seen, scene.seen.rgb.astype(np.float32)
         trial = self._trial(scene, R, self._suns, _TRIAL_PIXELS)
         promising = self._suns[np.argsort(trial, kind="stable")[:_N_SHADOWED]]
         cosine = self._viewer.sunlit_surfels(seen, promising @ R.astype(np.float32))
@@ -101,50 +115,23 @@ class SunMatcher:
             normals, albedo, scene.observed[::step].mean(axis=1), scene.beside / (3 * step), suns, self._encoded
         )
 
-    def _scene(
-        self, T_cam_target: NDArray[np.float64], frame: Frame, mask: NDArray[np.bool_], side_px: int
-    ) -> _Scene | None:
-        """What the reduced image shows where the target would be, None when that is out of view."""
-        crop = self._crop(T_cam_target, frame.camera, mask, side_px)
-        if crop is None:
-            return None
-        box, camera = crop
-        x0, y0, x1, y1 = box
-        size = (camera.width, camera.height)
-        image = cv2.resize(frame.rgb[y0:y1, x0:x1], size, interpolation=cv2.INTER_AREA)
-        share = cv2.resize(mask[y0:y1, x0:x1].astype(np.uint8) * 255, size, interpolation=cv2.INTER_AREA)
-        R, t = T_cam_target[:3, :3], T_cam_target[:3, 3]
-        rays = pixel_rays(camera, np.arange(camera.width), np.arange(camera.height)).reshape(-1, 3)
-        seen = self._viewer.surface(rays @ R, -t @ R)
+    def _scene(self, view: View, field: LightField) -> _Scene | None:
+        """What the image shows where the view's grid of rays sees the target, None when that is out of the image."""
+        height, width = field.mask.shape
+        rows, cols = view.mask.shape[0] // 2, view.mask.shape[1] // 2
+        step = -(-max(rows, cols) // _SIDE_POINTS)
+        row, col = np.arange(0, rows, step), np.arange(0, cols, step)
+        spacing_px = 2 / view.scale
+        u = np.rint(view.origin_px[0] + col * spacing_px).astype(np.intp)
+        v = np.rint(view.origin_px[1] + row * spacing_px).astype(np.intp)
+        in_u, in_v = (u >= 0) & (u < width), (v >= 0) & (v < height)
+        u, v, row, col = u[in_u], v[in_v], row[in_v], col[in_u]
+        seen = self._viewer.surfels(view, (row[:, None] * cols + col).ravel())
         if not len(seen.pixel):
             return None
-        bright = image.reshape(-1, 3).astype(np.float32)
-        observed = bright[seen.pixel]
-        bright *= share.reshape(-1, 1) * np.float32(1 / 255)
-        bright[seen.pixel] = 0.0
-        return _Scene(seen, observed, float(bright.sum()))
-
-    def _crop(
-        self, T_cam_target: NDArray[np.float64], camera: Camera, mask: NDArray[np.bool_], side_px: int
-    ) -> tuple[tuple[int, int, int, int], Camera] | None:
-        """Image box (x0, y0, x1, y1) that holds silhouette and mask, and the camera of its reduced image."""
-        bounds = self._viewer.bounds(T_cam_target, camera)
-        if bounds is None:
-            return None
-        left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
-        x0, y0 = max(min(int(bounds[0]), left), 0), max(min(int(bounds[1]), top), 0)
-        x1 = min(max(int(np.ceil(bounds[2])) + 1, left + width), camera.width)
-        y1 = min(max(int(np.ceil(bounds[3])) + 1, top + height), camera.height)
-        if x1 - x0 < 2 or y1 - y0 < 2:
-            return None
-        scale = min(1.0, side_px / max(x1 - x0, y1 - y0))
-        width, height = max(2, round((x1 - x0) * scale)), max(2, round((y1 - y0) * scale))
-        K = camera.K.copy()
-        K[0] *= width / (x1 - x0)
-        K[1] *= height / (y1 - y0)
-        K[0, 2] = (camera.K[0, 2] + 0.5 - x0) * width / (x1 - x0) - 0.5
-        K[1, 2] = (camera.K[1, 2] + 0.5 - y0) * height / (y1 - y0) - 0.5
-        return (x0, y0, x1, y1), Camera(K, width, height)
+        observed = field.smooth[v[:, None], u].reshape(-1, 3)[seen.pixel].astype(np.float32)
+        beside = _light_beside(field.image, field.mask, field.box, view.mask, view.origin_px, view.scale)
+        return _Scene(seen, observed, beside / (step * spacing_px) ** 2)
 
 
 def brightness(cosine: Float32) -> Float32:
@@ -159,6 +146,31 @@ def _even_directions(count: int) -> NDArray[np.float64]:
     azimuth = np.pi * (1.0 + np.sqrt(5.0)) * index
     radius = np.sqrt(1.0 - z * z)
     return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
+
+
+@njit(cache=True, nogil=True)
+def _light_beside(
+    image: NDArray[np.uint8],
+    mask: NDArray[np.bool_],
+    box: tuple[int, int, int, int],
+    silhouette: NDArray[np.bool_],
+    origin_px: NDArray[np.float64],
+    scale: float,
+) -> float:
+    """Sum over colours and pixels of what is bright in a mask, in a box (x, y, width, height), beside a silhouette."""
+    left, top, width, height = box
+    stride = max(1, max(width, height) // _SIDE_SAMPLES)
+    rows, cols = silhouette.shape
+    total = 0.0
+    for y in range(top, top + height, stride):
+        r = int(np.floor((y - origin_px[1]) * scale + 0.5))
+        for x in range(left, left + width, stride):
+            if not mask[y, x]:
+                continue
+            c = int(np.floor((x - origin_px[0]) * scale + 0.5))
+            if not (0 <= r < rows and 0 <= c < cols and silhouette[r, c]):
+                total += float(image[y, x, 0]) + float(image[y, x, 1]) + float(image[y, x, 2])
+    return total * stride * stride
 
 
 @njit(cache=True, nogil=True)

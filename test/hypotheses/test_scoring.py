@@ -21,7 +21,7 @@ def score(viewer, frame, mask, T):
     field = MaskField(mask)
     view = viewer.view(T, CAMERA, 96)
     fit = PoseFitter(viewer, 96, 200).iterate(T, view, CAMERA, frame.rgb, field, _MEASURE)
-    return log_score(Scorer(viewer, frame, field, 96).evidence(replace(fit, T_cam_target=T)))
+    return log_score(Scorer(viewer, frame, field, 96).evidence(fit, view))
 
 
 @pytest.mark.parametrize("seed", range(4))

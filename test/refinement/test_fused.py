@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 import pytest
-from shape_scene import CAMERA, picture, pose_errors, random_pose, spacecraft
+from shape_scene import CAMERA, picture, pose_errors, random_pose, spacecraft, sunlit_picture
 
 from hat_ros import lie
 from hat_ros.config import HatConfig, RefinementConfig
@@ -44,6 +44,17 @@ def test_a_perturbed_pose_converges(refiner, target, seed):
     assert shift < 0.005
     assert refined.overlap > 0.93
     assert refined.support > 0.9
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_lies_in_shadow_does_not_drag_the_pose(refiner, target, seed):
+    rng = np.random.default_rng(seed)
+    T_true = random_pose(rng, target)
+    frame, mask = sunlit_picture(target, T_true, (-1.0, 0.4, -0.1))
+    refined = refiner.refine(frame, Detection(mask), perturbed(T_true, rng, 3.0, 0.02))
+    turn, shift = pose_errors(refined.T_cam_target, T_true)
+    assert turn < 3.0
+    assert shift < 0.02
 
 
 @pytest.mark.parametrize("wide", [False, True])

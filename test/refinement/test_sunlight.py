@@ -3,7 +3,7 @@ import pytest
 from shape_scene import CAMERA, random_pose, spacecraft, sunlit_picture
 
 from hat_ros import lie
-from hat_ros.refinement.sunlight import SunMatcher, brightness
+from hat_ros.refinement.sunlight import LightField, SunMatcher, brightness
 from hat_ros.refinement.view import MaskField, TargetViewer, contour_lines
 from hat_ros.render.embree import pixel_rays
 from hat_ros.types import Frame
@@ -21,6 +21,10 @@ def matcher(viewer):
     return SunMatcher(viewer)
 
 
+def light(matcher, viewer, T, frame, mask, side_px=96):
+    return matcher.match(viewer.view(T, CAMERA, side_px), LightField(frame.rgb, mask))
+
+
 def turned(T, rotvec):
     out = T.copy()
     out[:3, :3] = T[:3, :3] @ lie.so3_exp(np.array(rotvec))
@@ -32,9 +36,9 @@ def turned(T, rotvec):
 def test_the_true_pose_explains_light_and_shadow_best(viewer, matcher, sun, seed):
     T_true = random_pose(np.random.default_rng(seed), viewer.target)
     frame, mask = sunlit_picture(viewer.target, T_true, sun)
-    truth = matcher.match(T_true, frame, mask)
+    truth = light(matcher, viewer, T_true, frame, mask)
     for rotvec in ((np.pi, 0, 0), (0, np.pi, 0), (0, 0, np.pi), (0.8, 0.0, 0.6)):
-        assert truth.distance < matcher.match(turned(T_true, rotvec), frame, mask).distance
+        assert truth.distance < light(matcher, viewer, turned(T_true, rotvec), frame, mask).distance
 
 
 def test_the_sun_is_found_where_it_is(viewer, matcher):
@@ -42,7 +46,7 @@ def test_the_sun_is_found_where_it_is(viewer, matcher):
     for seed in range(6):
         T_true = random_pose(np.random.default_rng(seed), viewer.target)
         frame, mask = sunlit_picture(viewer.target, T_true, SUNS["beside"])
-        found = matcher.match(T_true, frame, mask).to_sun_cam
+        found = light(matcher, viewer, T_true, frame, mask).to_sun_cam
         errors.append(np.degrees(np.arccos(found @ np.array(SUNS["beside"]) / np.linalg.norm(SUNS["beside"]))))
     assert np.median(errors) < 20
 
@@ -52,7 +56,7 @@ def test_exposure_does_not_matter(viewer, matcher):
     distances = []
     for exposure in (0.4, 0.8):
         frame, mask = sunlit_picture(viewer.target, T_true, SUNS["beside"], exposure)
-        distances.append(matcher.match(T_true, frame, mask).distance)
+        distances.append(light(matcher, viewer, T_true, frame, mask).distance)
     assert distances[0] == pytest.approx(distances[1], abs=0.03)
 
 
@@ -61,7 +65,8 @@ def test_light_beside_the_silhouette_counts_against_a_pose(viewer, matcher):
     frame, mask = sunlit_picture(viewer.target, T_true, SUNS["beside"])
     beside = T_true.copy()
     beside[0, 3] += 0.5
-    assert matcher.match(beside, frame, mask).distance > matcher.match(T_true, frame, mask).distance + 0.1
+    truth = light(matcher, viewer, T_true, frame, mask)
+    assert light(matcher, viewer, beside, frame, mask).distance > truth.distance + 0.1
 
 
 def test_a_black_image_explains_nothing(viewer, matcher):
@@ -69,14 +74,29 @@ def test_a_black_image_explains_nothing(viewer, matcher):
     frame = Frame(1, np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8), CAMERA)
     mask = np.zeros((CAMERA.height, CAMERA.width), bool)
     mask[100:120, 100:120] = True
-    assert matcher.match(T, frame, mask).distance == 1.0
+    assert light(matcher, viewer, T, frame, mask).distance == 1.0
 
 
-def test_a_target_behind_the_camera_has_no_light(viewer, matcher):
+def test_a_target_beside_the_image_has_no_light(viewer, matcher):
     T = random_pose(np.random.default_rng(2), viewer.target)
     frame, mask = sunlit_picture(viewer.target, T, SUNS["beside"])
-    T[2, 3] = -5.0
-    assert matcher.match(T, frame, mask) is None
+    view = viewer.view(T, CAMERA, 96).shifted(np.array([2.0 * CAMERA.width, 0.0]))
+    assert matcher.match(view, LightField(frame.rgb, mask)) is None
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_size_of_the_view_does_not_matter(viewer, matcher, seed):
+    T_true = random_pose(np.random.default_rng(seed), viewer.target)
+    frame, mask = sunlit_picture(viewer.target, T_true, SUNS["beside"])
+    coarse, fine = (light(matcher, viewer, T_true, frame, mask, side_px).distance for side_px in (96, 200))
+    assert coarse == pytest.approx(fine, abs=0.05)
+
+
+def test_a_view_put_in_sunlight_is_the_view_cast_in_it(viewer):
+    T, sun = random_pose(np.random.default_rng(5), viewer.target), np.array(SUNS["beside"])
+    at_once = viewer.view(T, CAMERA, 96, sun)
+    later = viewer.in_sunlight(viewer.view(T, CAMERA, 96), sun)
+    np.testing.assert_array_equal(at_once.lit, later.lit)
 
 
 def test_many_suns_at_once_light_what_each_lights(viewer):
