@@ -135,8 +135,7 @@ class TemplateHypotheses:
             starts.append(self._fitter.centred(prior.T_cam_target, frame.camera, field, scorer.luma))
             if prior.healthy:
                 n_coarse = max(1, n_coarse // _TRACKED_DIVISOR)
-        # Before a dark sky a thin strip may be all that is lit.
-        body = mask if scorer.dark_around else without_thin_parts(mask)
+        body = without_thin_parts(mask)
         placements = whole_placement(body)
         aligned = self._align(starts + self._coarse(body, placements, frame, field, n_coarse), frame, scorer)
         best = max(aligned, key=lambda a: a.score, default=None)
