@@ -5,8 +5,9 @@ transformed over the polar angle, so that turning the camera about its axis is a
 sparse set of contour points in 3-D, from which a pose can be refined without rendering. Built once per model in about
 two seconds and kept in the platform's cache folder.
 
-Booms and antennas are left out of both sides of the comparison: they have much outline and little area, a mask rarely
-shows them, and contour points on them would drag a pose towards a part of the mask that they do not belong to.
+Booms and antennas can be left out of both sides of the comparison. They have much outline and little area; before a
+black sky they show, before anything else a mask hardly ever has them, and then contour points on them would drag a pose
+towards a part of the mask that they do not belong to.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from hat_ros.target import Target
 from hat_ros.types import Camera
 
 # Raised whenever the content of a bank changes its meaning: older cache files are then not found.
-_FORMAT = 2
+_FORMAT = 1
 N_RINGS = 32
 # Outer radius of the polar grid in radii of gyration: the far end of a lopsided slender body lies at about 2.5.
 MAX_RADIUS = 2.6
@@ -68,17 +69,23 @@ class ViewBank:
         return 2 * (self.spectrum.shape[0] - 1)
 
 
-def load_or_build(target: Target, renderer: Renderer, n_views: int, n_angles: int) -> ViewBank:
+def load_or_build(target: Target, renderer: Renderer, n_views: int, n_angles: int, thin_parts: bool = True) -> ViewBank:
     """The bank of a target from the cache folder, built and stored there when it is absent or damaged."""
-    settings = f"{_FORMAT}:{n_views}:{n_angles}:{N_RINGS}:{MAX_RADIUS}:{CONTOUR_POINTS}:{_DISTANCE_RADII}:{_RENDER_PX}"
+    grid = f"{n_angles}:{N_RINGS}:{MAX_RADIUS}:{CONTOUR_POINTS}:{_DISTANCE_RADII}:{_RENDER_PX}"
+    thin = "" if thin_parts else f":{_THIN_SHARE}:{_THIN_BODY_SHARE}"
     arrays = cached_arrays(
-        "views", f"{target.sha256}:{settings}", lambda: vars(build(target, renderer, n_views, n_angles))
+        "views",
+        f"{target.sha256}:{_FORMAT}:{n_views}:{grid}{thin}",
+        lambda: vars(build(target, renderer, n_views, n_angles, thin_parts)),
     )
     return ViewBank(**arrays)
 
 
-def build(target: Target, renderer: Renderer, n_views: int, n_angles: int) -> ViewBank:
-    """Render every view and describe it. ``n_views``: an icosphere size (162, 642, 2562); ``n_angles`` even."""
+def build(target: Target, renderer: Renderer, n_views: int, n_angles: int, thin_parts: bool = True) -> ViewBank:
+    """Render every view and describe it, with or without its thin parts.
+
+    ``n_views``: an icosphere size (162, 642, 2562); ``n_angles`` even.
+    """
     rotations = view_rotations(n_views)
     center, radius = target.center_m, target.bounding_radius_m
     distance = _DISTANCE_RADII * radius
@@ -94,12 +101,12 @@ def build(target: Target, renderer: Renderer, n_views: int, n_angles: int) -> Vi
         view = renderer.render(T, camera, color=False)
         if not view.mask.any():  # a flat body seen exactly edge-on
             continue
-        body = without_thin_parts(view.mask)
-        center_px, gyration_px = mask_moments(body)
-        rings[i] = polar_grid(body.astype(np.float32), center_px, gyration_px, n_angles)
+        shape = view.mask if thin_parts else without_thin_parts(view.mask)
+        center_px, gyration_px = mask_moments(shape)
+        rings[i] = polar_grid(shape.astype(np.float32), center_px, gyration_px, n_angles)
         gyration[i] = gyration_px / focal
         centroid[i] = (center_px - K[:2, 2]) / focal
-        table = contour_table(view.depth_m, body, K, CONTOUR_POINTS)
+        table = contour_table(view.depth_m, shape, K, CONTOUR_POINTS)
         contour[i, : len(table)] = (table[:, :3] - T[:3, 3]) @ R
         weight[i, : len(table)] = table[:, COL_WEIGHT]
     spectrum = np.ascontiguousarray(np.fft.rfft(rings, axis=1).transpose(1, 0, 2).astype(np.complex64))
@@ -108,7 +115,7 @@ def build(target: Target, renderer: Renderer, n_views: int, n_angles: int) -> Vi
 
 
 def without_thin_parts(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """A silhouette (H, W) with at least one pixel, its booms and antennas left out: what banks are compared by."""
+    """A silhouette (H, W) with at least one pixel, its booms and antennas left out."""
     silhouette = np.ascontiguousarray(mask).view(np.uint8)
     x, y, width, height = cv2.boundingRect(silhouette)
     radius = round(_THIN_SHARE * max(width, height))

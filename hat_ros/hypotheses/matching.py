@@ -101,7 +101,7 @@ def match_shape(
 
     Args:
         bank: the target's views.
-        mask: (H, W) bool, without thin parts, as the views are.
+        mask: (H, W) bool, without thin parts if the views are.
         placements: assumptions about centre and size, at least one.
         camera: intrinsics of the image.
         n_best: at most this many.

@@ -96,6 +96,14 @@ class Aligned:
     score: float
 
 
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """Views, and the mask (H, W) bool that they are compared with: both with their thin parts, or both without."""
+
+    bank: ViewBank
+    mask: NDArray[np.bool_]
+
+
 class TemplateHypotheses:
     """Backend ``template``; see the module's text.
 
@@ -104,15 +112,15 @@ class TemplateHypotheses:
         target: the CAD model.
 
     Raises:
-        ConfigError: ``n_views`` is no icosphere size or ``n_angles`` is odd.
+        ConfigError: ``n_views`` is no icosphere size or ``n_angles`` no multiple of four.
     """
 
     def __init__(self, config: HatConfig, target: Target) -> None:
         options = config.hypotheses.template
         if options.n_views not in _VIEW_COUNTS:
             raise ConfigError(f"hypotheses.template.n_views must be one of {_VIEW_COUNTS}, found {options.n_views}")
-        if options.n_angles % 2:
-            raise ConfigError(f"hypotheses.template.n_angles must be even, found {options.n_angles}")
+        if options.n_angles % 4:
+            raise ConfigError(f"hypotheses.template.n_angles must be a multiple of 4, found {options.n_angles}")
         self._options = options
         self._max_candidates = config.hypotheses.max_candidates
         self._target = target
@@ -120,7 +128,9 @@ class TemplateHypotheses:
         self._fitter = PoseFitter(self._viewer, options.render_px, _CONTOUR_POINTS)
         self._sun = SunMatcher(self._viewer)
         self._lit_bank = load_or_build_lit(self._viewer, options.n_angles // 2)
-        self._bank = load_or_build(target, create_renderer("embree", target), options.n_views, options.n_angles)
+        renderer = create_renderer("embree", target)
+        self._bank = load_or_build(target, renderer, options.n_views, options.n_angles)
+        self._body_bank = load_or_build(target, renderer, options.n_views, options.n_angles, thin_parts=False)
 
     def generate(self, frame: Frame, detection: Detection, prior: PosePrior | None) -> Candidates:
         """Up to K refined and scored poses, best first; zero rows when nothing fits."""
@@ -135,9 +145,11 @@ class TemplateHypotheses:
             starts.append(self._fitter.centred(prior.T_cam_target, frame.camera, field, scorer.luma))
             if prior.healthy:
                 n_coarse = max(1, n_coarse // _TRACKED_DIVISOR)
-        body = without_thin_parts(mask)
-        placements = whole_placement(body)
-        aligned = self._align(starts + self._coarse(body, placements, frame, field, n_coarse), frame, scorer)
+        compared = Compared(self._bank, mask)
+        if not scorer.dark_around:  # thin parts show before a black sky only
+            compared = Compared(self._body_bank, without_thin_parts(mask))
+        placements = whole_placement(compared.mask)
+        aligned = self._align(starts + self._coarse(compared, placements, frame, field, n_coarse), frame, scorer)
         best = max(aligned, key=lambda a: a.score, default=None)
         # Light will find what lies in shadow; without a prior both ways are tried.
         relies_on_light = scorer.dark_around and prior is not None
@@ -145,9 +157,9 @@ class TemplateHypotheses:
         if best is None or not (explained or relies_on_light):
             # The mask is not the whole silhouette: look for those that it may be a part of.
             cut = detection.touches_border()
-            placements = cut_placements(body) if cut else partial_placements(body)
+            placements = cut_placements(compared.mask) if cut else partial_placements(compared.mask)
             n_coarse = n_usual
-            aligned += self._align(self._coarse(body, placements, frame, field, n_coarse), frame, scorer)
+            aligned += self._align(self._coarse(compared, placements, frame, field, n_coarse), frame, scorer)
         selected = self._select(aligned, self._max_candidates)
         scored = self._finish(selected, frame, scorer)
         leader = max(scored, key=lambda pair: pair[1], default=None)
@@ -158,7 +170,7 @@ class TemplateHypotheses:
             lit = self._align(starts + self._coarse_lit(n_lit, frame, scorer), frame, scorer, in_sunlight=True)
             scored += self._finish(lit, frame, scorer)
         elif not self._is_clear(scored, prior):
-            further = self._coarse(body, placements, frame, field, _MORE_COARSE * n_usual, n_coarse)
+            further = self._coarse(compared, placements, frame, field, _MORE_COARSE * n_usual, n_coarse)
             aligned += self._align(further, frame, scorer)
             more = self._select(aligned, 2 * self._max_candidates)
             scored += self._finish([start for start in more if start not in selected], frame, scorer)
@@ -174,7 +186,7 @@ class TemplateHypotheses:
 
     def _coarse(
         self,
-        body: NDArray[np.bool_],
+        compared: Compared,
         placements: list[Placement],
         frame: Frame,
         field: MaskField,
@@ -184,8 +196,8 @@ class TemplateHypotheses:
         """The best shape matches after those that are known already, pulled onto the mask's boundary."""
         options = self._options
         matches = match_shape(
-            self._bank,
-            body,
+            compared.bank,
+            compared.mask,
             placements,
             frame.camera,
             n_coarse,
@@ -193,7 +205,7 @@ class TemplateHypotheses:
             self._target.center_m,
         )
         further = ShapeMatches(matches.T_cam_target[n_known:], matches.view[n_known:], matches.score[n_known:])
-        return self._pulled(self._bank, further, frame, field)
+        return self._pulled(compared.bank, further, frame, field)
 
     def _coarse_lit(self, n_lit: int, frame: Frame, scorer: Scorer) -> list[NDArray[np.float64]]:
         """The best matches of brightness."""
