@@ -78,9 +78,7 @@ class TemplateConfig:
     n_views: int = option(642, "view directions on the sphere: 162, 642 or 2562", low=162, high=2562)
     n_angles: int = option(72, "in-plane angles compared for each view", low=24, high=360)
     n_coarse: int = option(24, "distinct shape matches (x3 without a prior); a third is refined", low=1, high=256)
-    n_coarse_lit: int = option(
-        8, "distinct matches of brightness refined before a black sky (a quarter with a prior)", low=1, high=64
-    )
+    n_coarse_lit: int = option(8, "distinct matches of brightness that are refined before a black sky", low=1, high=64)
     separation_deg: float = option(15.0, "candidates closer than this are one basin", low=1, high=90)
     render_px: int = option(96, "longer side of the views rendered for refinement and scoring", low=48, high=512)
 

@@ -70,8 +70,6 @@ _POOR_SCORE = -6.0
 _LIGHT_MATTERS = 14.0
 # With a healthy prior among the starts, fewer matches: they are there to contradict it, not to find the target.
 _TRACKED_DIVISOR = 2
-# With any prior, fewer matches of brightness: the light that suits the prior itself finds as much as most of them.
-_AIDED_LIT_DIVISOR = 4
 # A lead in log-likelihood that ends the search; without one, so many times the usual shape matches are tried.
 _CLEAR_LEAD = 6.0
 _MORE_COARSE = 3
@@ -112,22 +110,22 @@ class TemplateHypotheses:
         target: the CAD model.
 
     Raises:
-        ConfigError: ``n_views`` is no icosphere size or ``n_angles`` no multiple of four.
+        ConfigError: ``n_views`` is no icosphere size or ``n_angles`` is odd.
     """
 
     def __init__(self, config: HatConfig, target: Target) -> None:
         options = config.hypotheses.template
         if options.n_views not in _VIEW_COUNTS:
             raise ConfigError(f"hypotheses.template.n_views must be one of {_VIEW_COUNTS}, found {options.n_views}")
-        if options.n_angles % 4:
-            raise ConfigError(f"hypotheses.template.n_angles must be a multiple of 4, found {options.n_angles}")
+        if options.n_angles % 2:
+            raise ConfigError(f"hypotheses.template.n_angles must be even, found {options.n_angles}")
         self._options = options
         self._max_candidates = config.hypotheses.max_candidates
         self._target = target
         self._viewer = TargetViewer(target)
         self._fitter = PoseFitter(self._viewer, options.render_px, _CONTOUR_POINTS)
         self._sun = SunMatcher(self._viewer)
-        self._lit_bank = load_or_build_lit(self._viewer, options.n_angles // 2)
+        self._lit_bank = load_or_build_lit(self._viewer, options.n_angles)
         renderer = create_renderer("embree", target)
         self._bank = load_or_build(target, renderer, options.n_views, options.n_angles)
         self._body_bank = load_or_build(target, renderer, options.n_views, options.n_angles, thin_parts=False)
@@ -165,9 +163,7 @@ class TemplateHypotheses:
         leader = max(scored, key=lambda pair: pair[1], default=None)
         if scorer.dark_around and (leader is None or not self._confirms(leader[0], prior)):
             # What lies in shadow is missing from the mask: compare what is bright.
-            n_lit = self._options.n_coarse_lit
-            n_lit = n_lit if prior is None else max(1, n_lit // _AIDED_LIT_DIVISOR)
-            lit = self._align(starts + self._coarse_lit(n_lit, frame, scorer), frame, scorer, in_sunlight=True)
+            lit = self._align(starts + self._coarse_lit(frame, scorer), frame, scorer, in_sunlight=True)
             scored += self._finish(lit, frame, scorer)
         elif not self._is_clear(scored, prior):
             further = self._coarse(compared, placements, frame, field, _MORE_COARSE * n_usual, n_coarse)
@@ -207,12 +203,14 @@ class TemplateHypotheses:
         further = ShapeMatches(matches.T_cam_target[n_known:], matches.view[n_known:], matches.score[n_known:])
         return self._pulled(compared.bank, further, frame, field)
 
-    def _coarse_lit(self, n_lit: int, frame: Frame, scorer: Scorer) -> list[NDArray[np.float64]]:
+    def _coarse_lit(self, frame: Frame, scorer: Scorer) -> list[NDArray[np.float64]]:
         """The best matches of brightness."""
         light, options = scorer.light(), self._options
         if light is None:
             return []
-        matches = match_light(self._lit_bank, light, frame.camera, n_lit, options.separation_deg, self._target.center_m)
+        matches = match_light(
+            self._lit_bank, light, frame.camera, options.n_coarse_lit, options.separation_deg, self._target.center_m
+        )
         return list(matches.T_cam_target)
 
     def _pulled(

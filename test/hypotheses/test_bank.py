@@ -1,11 +1,13 @@
 import numpy as np
 import pytest
+import trimesh
 from shape_scene import spacecraft
 
 from hat_ros import lie
 from hat_ros.cache import cache_folder
 from hat_ros.hypotheses import bank
 from hat_ros.render import create_renderer
+from hat_ros.target import target_from_scene
 
 
 @pytest.fixture(scope="module")
@@ -114,3 +116,18 @@ def test_a_mask_without_the_boom_has_the_moments_of_the_view_with_it():
     np.testing.assert_allclose(shown[0], seen[0], atol=0.5)
     assert shown[1] == pytest.approx(seen[1], rel=0.02)
     assert bank.mask_moments(with_boom)[1] > 1.2 * seen[1]  # so much the boom would have changed it
+
+
+def test_a_bank_without_thin_parts_describes_the_body_that_carries_them():
+    body = trimesh.creation.box((1.0, 0.7, 0.5))
+    boom = trimesh.creation.cylinder(0.013, 1.6, transform=lie.transform(np.eye(3), [0.0, 0.0, 0.8]))
+    whole = target_from_scene(trimesh.Scene([body, boom]), "with a boom")
+    renderer = create_renderer("embree", whole)
+    with_boom, without = (bank.build(whole, renderer, 162, 24, thin_parts) for thin_parts in (True, False))
+    on_boom = [
+        np.where(views.contour_m[..., 2] > 0.6, views.contour_weight, 0.0).sum(axis=1) for views in (with_boom, without)
+    ]
+    assert on_boom[1].sum() < 0.25 * on_boom[0].sum()  # a grid lets some diagonal ones through
+    rid = (on_boom[0] > 0) & (on_boom[1] == 0)
+    assert rid.mean() > 0.5
+    assert (without.gyration[rid] < with_boom.gyration[rid]).all()
