@@ -230,16 +230,16 @@ def _run(
     """Process all frames, write bag and live tables, return what was measured."""
     rows: list[tuple[float, ...]] = []
     steps: list[Step] = []
-    silhouettes = Silhouettes()
     total = source.count(options.start, options.limit)
     with (
         closing(LiveTables(folder.path, MEASURED)) as tables,
         ResultBagWriter(folder.bag_path, source.frame_id, source.target.name) as bag,
+        closing(Silhouettes()) as silhouettes,
     ):
         try:
             for done in pipeline.run(source.frames(options.start, options.limit, masks_given)):
                 rows.append(done.measured())
-                if done.stage_ms["segmentation"] > 0.0:
+                if done.step.detection is not None or done.stage_ms["segmentation"] > 0.0:
                     silhouettes.remember(done.step)
                 if pipeline.causal:
                     tables.add(done.step.estimate, rows[-1])
@@ -256,10 +256,10 @@ def _run(
                 bag.write_step(step, pipeline.rejected)
         finally:
             bag.write_context(source.recording.camera, source.truth_rows())
+        overlaps = silhouettes.overlaps(source.masks(options.start, options.limit))
     if not rows:
         raise RunError(f"no frame of {source.path} could be used, {pipeline.rejected} were rejected (stamp or image)")
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    overlaps = silhouettes.overlaps(source.masks(options.start, options.limit))
     write_overlaps(folder.path, overlaps)
     speed, memory = latency_summary(rows, finish_s), {"peak_memory_mib": peak_mib} | memory_summary(rows)
     return speed | memory | mask_summary(np.array(list(overlaps.values())))

@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from scripted import CAMERA, ScriptedMethod, frame, stamp, true_row
+from scripted import CAMERA, ScriptedMethod, frame, mask, stamp, true_row
 
 from hat_ros import lie
 from hat_ros.bag import BagWriter
@@ -25,7 +25,8 @@ def bag(tmp_path):
     with BagWriter(tmp_path / "clip", image_format="png") as writer:
         for i in range(10):
             T = lie.matrix_from_row(true_row(i))
-            writer.write_frame(stamp(i), frame(i).rgb, CAMERA, T_cam_target=T)
+            recorded = mask().astype(np.uint8) * np.uint8(255)
+            writer.write_frame(stamp(i), frame(i).rgb, CAMERA, mask=recorded, T_cam_target=T)
         writer.write_target(model)
     return tmp_path / "clip"
 
@@ -148,6 +149,28 @@ def test_track_writes_the_promised_folder(scripted, bag, settings, tmp_path, cap
     assert all(metrics[name] is not None for name in promised)
     assert (metrics["frames"], metrics["valid"]) == (10, 7)
     assert "pose error" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("backend", "given"), [("classical", False), ("annotated", True)])
+def test_recorded_masks_reach_the_method_only_when_given_and_judge_its_own_either_way(
+    monkeypatch, bag, settings, tmp_path, backend, given
+):
+    import hat_ros.runner
+
+    seen = []
+
+    class Sees(ScriptedMethod):
+        def step(self, frame):
+            seen.append(frame.given_mask is not None)
+            return super().step(frame)
+
+    monkeypatch.setattr(hat_ros.runner, "create_method", lambda *_: Sees())
+    command = ["track", str(bag), "--out", str(tmp_path / "out"), "--config", settings, "--quiet", "--no-video"]
+    assert main([*command, "--no-report", "--set", f"segmentation.backend={backend}"]) == 0
+    assert seen == [given] * 10
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["mask_iou_mean"] == 1.0
+    assert len((tmp_path / "out" / "masks.csv").read_text().splitlines()) == 11
 
 
 def test_evaluate_reproduces_the_metrics_and_keeps_what_was_measured(scripted, bag, settings, tmp_path):
