@@ -1,11 +1,13 @@
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from shape_scene import CAMERA, picture, pose_errors, random_pose, spacecraft, sunlit_picture
 
 from hat_ros import lie
 from hat_ros.config import HatConfig, RefinementConfig
 from hat_ros.refinement import create_refiner
+from hat_ros.target import target_from_scene
 from hat_ros.types import Detection, Frame, RotationPrior
 
 ENABLED = HatConfig(refinement=RefinementConfig(enabled=True))
@@ -55,6 +57,23 @@ def test_what_lies_in_shadow_does_not_drag_the_pose(refiner, target, seed):
     turn, shift = pose_errors(refined.T_cam_target, T_true)
     assert turn < 3.0
     assert shift < 0.02
+
+
+def test_a_dark_rim_makes_no_round_body_small_and_far_frame_after_frame():
+    barrel = trimesh.creation.cylinder(0.5, 1.6)
+    box = trimesh.creation.box((0.5, 0.4, 0.3), transform=lie.transform(np.eye(3), [0.45, 0.0, 0.7]))
+    for mesh in (barrel, box):
+        mesh.visual.face_colors = np.tile([170, 170, 170, 255], (len(mesh.faces), 1))
+    target = target_from_scene(trimesh.Scene([barrel, box]), "barrel")
+    T_true = random_pose(np.random.default_rng(6), target)
+    frame, silhouette = sunlit_picture(target, T_true, (-1.0, 0.3, -1.0))
+    lit = silhouette & (frame.rgb.max(axis=2) > 12)
+    assert 0.1 < 1.0 - lit.sum() / silhouette.sum() < 0.2
+    refiner, T = create_refiner(ENABLED, target), T_true
+    for _ in range(10):
+        T = refiner.refine(frame, Detection(lit), T).T_cam_target
+    assert pose_errors(T, T_true)[0] < 2.0
+    assert T[2, 3] / T_true[2, 3] == pytest.approx(1.0, abs=0.02)
 
 
 @pytest.mark.parametrize("wide", [False, True])
