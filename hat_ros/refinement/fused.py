@@ -17,7 +17,7 @@ from hat_ros.types import Detection, Frame, Refined, RotationPrior
 
 # The mask's robust scales are meant for a target of this size or more and shrink with smaller ones.
 _USUAL_SIZE_PX = 250.0
-# Share of a silhouette that is black on black from which the sun is looked for. Less of it missing makes a pose a little
+# Share of a silhouette that is black on black from which the sun is looked for. Missing less makes a pose a little
 # small and far, which then misses still less: over many frames that adds up.
 _SHADOW_SHARE = 0.05
 _SCALE_LIMITS = (0.4, 1.0)
