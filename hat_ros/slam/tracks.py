@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
@@ -146,13 +147,28 @@ def detect(image: Image, region: Image, taken: Float, count: int, spacing_px: fl
         return np.zeros((0, 2))
     free = region[y : y + height, x : x + width].copy()
     radius = max(1, round(spacing_px))
-    for center in np.rint(taken).astype(int) - [x, y]:
-        cv2.circle(free, center.tolist(), radius, 0, -1)
+    disk = cv2.circle(np.zeros((2 * radius + 1, 2 * radius + 1), np.uint8), (radius, radius), radius, 1, -1)
+    clear_disks(free, np.rint(taken).astype(np.int64) - [x, y], disk)
     crop = np.ascontiguousarray(image[y : y + height, x : x + width])
     corners = cv2.goodFeaturesToTrack(crop, count, _CORNER_QUALITY, spacing_px, mask=free, blockSize=5)
     if corners is None:
         return np.zeros((0, 2))
     return corners[:, 0].astype(np.float64) + np.array([x, y])
+
+
+@njit(cache=True)
+def clear_disks(mask: Image, centers: NDArray[np.int64], disk: Image) -> None:
+    """Set a mask (H, W) to zero where disk (2 r + 1, 2 r + 1) is not, laid on each of the centers (M, 2) x, y.
+
+    Keeps the interpreter lock: one call per point of OpenCV would hand it over as often.
+    """
+    radius = disk.shape[0] // 2
+    for i in range(len(centers)):
+        x0, y0 = centers[i, 0] - radius, centers[i, 1] - radius
+        for y in range(max(0, -y0), min(disk.shape[0], mask.shape[0] - y0)):
+            for x in range(max(0, -x0), min(disk.shape[1], mask.shape[1] - x0)):
+                if disk[y, x]:
+                    mask[y0 + y, x0 + x] = 0
 
 
 def _crop(shape: tuple[int, ...], xy: Float) -> tuple[int, int, int, int]:

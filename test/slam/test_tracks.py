@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hat_ros.slam.tracks import PointTracks, detect, follow
+from hat_ros.slam.tracks import PointTracks, clear_disks, detect, follow
 
 
 @pytest.fixture(scope="module")
@@ -86,3 +86,18 @@ def test_points_that_leave_the_region_are_dropped(texture):
     tracks.advance(texture, region, tracks.xy.copy())
     assert tracks.alive.any()
     assert (tracks.xy[tracks.alive, 0] >= texture.shape[1] // 2 - 0.5).all()
+
+
+def test_disks_are_cleared_as_far_as_they_lie_on_the_mask():
+    rng = np.random.default_rng(1)
+    for _ in range(50):
+        height, width = rng.integers(5, 90, 2)
+        radius = int(rng.integers(1, 30))
+        centers = rng.integers(-40, 130, (rng.integers(0, 12), 2))
+        disk = cv2.circle(np.zeros((2 * radius + 1, 2 * radius + 1), np.uint8), (radius, radius), radius, 1, -1)
+        mask = np.full((height, width), 255, np.uint8)
+        expected = mask.copy()
+        for center in centers:
+            cv2.circle(expected, center.tolist(), radius, 0, -1)
+        clear_disks(mask, centers, disk)
+        np.testing.assert_array_equal(mask, expected)
