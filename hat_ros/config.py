@@ -45,7 +45,7 @@ class ClassicalConfig:
 
     sky_border_share: float = option(0.7, "share of dark image border from which the background is black sky", low=0)
     work_side_px: int = option(96, "longer side of the reduced crop of the region model", low=48, high=512)
-    cold_side_px: int = option(112, "longer side of the reduced image of a search from nothing", low=48, high=320)
+    cold_side_px: int = option(144, "longer side of the reduced image of a search from nothing", low=48, high=320)
     check_interval_frames: int = option(20, "frames between independent checks of a tracked mask", low=1)
     min_prior_overlap: float = option(0.6, "overlap with the mask below which a prior is not used", low=0, high=1)
     min_shape_overlap: float = option(0.75, "overlap with the nearest CAD silhouette that a found mask needs", low=0)

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hat_ros.segmentation.ground import GroundEvidence
-from hat_ros.segmentation.masks import Mask, fill_holes
+from hat_ros.segmentation.masks import SIDES, Mask, fill_holes
 
 _COLD_ITERATIONS = 3
 _RING_SHARE = 0.02  # width of the image border taken as background, of the longer side
 _PIECE_SHARE = 0.03  # pieces smaller than this share of the largest are not the target's
 _MOTION_REACH = 0.6  # of the size of what moved: how far beyond it the target may extend
+_CLOSED_SHORT = 0.5  # of its length: how far before the border a closed cut of what that cuts off may end
 _OPEN_BESIDE = 0.25  # of what is known of the target: how far beyond its extent a side opens
 
 _K3 = np.ones((3, 3), np.uint8)
@@ -117,7 +118,7 @@ def cut_from_nothing(rgb: NDArray[np.uint8], open_side: str | None = None, near:
         near: 0/1 mask of what is known of the target; the side opens only beside it.
     """
     labels = np.full(rgb.shape[:2], cv2.GC_PR_FGD, np.uint8)
-    ring = max(2, round(_RING_SHARE * max(rgb.shape[:2])))
+    ring = _ring_px(rgb)
     labels[:ring] = labels[-ring:] = cv2.GC_BGD
     labels[:, :ring] = labels[:, -ring:] = cv2.GC_BGD
     if open_side is not None:
@@ -136,6 +137,22 @@ def cut_from_nothing(rgb: NDArray[np.uint8], open_side: str | None = None, near:
         labels[part] = cv2.GC_PR_FGD
     cut = graph_cut(rgb, labels, ColorModels(), _COLD_ITERATIONS)
     return None if cut is None else tidy(cut, None)
+
+
+def near_sides(closed: Mask) -> tuple[str, ...]:
+    """Sides of the image at which more of a target may be than a closed cut from nothing holds, 0/1.
+
+    Its part at the border gives its colours to the background, so that the cut may end some way before it.
+    """
+    x, y, w, h = cv2.boundingRect(closed)
+    reach = _ring_px(closed) + _CLOSED_SHORT * max(w, h)
+    height, width = closed.shape
+    gaps = (y, height - y - h, x, width - x - w)
+    return tuple(side for side, gap in zip(SIDES, gaps, strict=True) if gap <= reach)
+
+
+def _ring_px(image: NDArray[np.uint8]) -> int:
+    return max(2, round(_RING_SHARE * max(image.shape[:2])))
 
 
 def cut_from_motion(rgb: NDArray[np.uint8], moving: Mask) -> Mask | None:

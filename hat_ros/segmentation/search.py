@@ -245,17 +245,18 @@ class Search:
 
 
 def _cold_cuts(rgb: NDArray[np.uint8], motion: MotionEvidence | None, open_sides: tuple[str, ...]) -> list[Mask | None]:
-    """The closed cut, the one from motion if there is any, and one for each open side, two at a time.
+    """The closed cut, the one from motion if there is any, and one for each open side that the closed cut is near.
 
-    A search takes as long as all other frames of a second: it must not hold up the next frame for longer than it has
-    to. Each cut seeds the generator of its own thread, so which runs where does not matter.
+    Two at a time: a search takes as long as several frames and must not hold up the next one for longer than it has to.
+    Each cut seeds the generator of its own thread, so which runs where does not matter.
     """
     with ThreadPoolExecutor(2) as pool:
         cuts = [pool.submit(region.cut_from_nothing, rgb)]
         if motion is not None:
             cuts.append(pool.submit(region.cut_from_motion, rgb, motion.moving))
         closed = cuts[0].result()
-        cuts += [pool.submit(region.cut_from_nothing, rgb, side, closed) for side in open_sides]
+        near = open_sides if closed is None else region.near_sides(closed)
+        cuts += [pool.submit(region.cut_from_nothing, rgb, side, closed) for side in open_sides if side in near]
         return [cut.result() for cut in cuts]
 
 
