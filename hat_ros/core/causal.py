@@ -30,7 +30,8 @@ class Fused:
         measurement: (4, 4) what this frame's own image says, None when it says nothing.
         covariance: (6, 6) of the measurement, None when its source does not know.
         confirmed: the image is certain of the measurement's basin, or an anchor has agreed with it.
-        doubtful: successive anchors stand in another basin than the measurement.
+        doubtful: successive anchors stand in another basin than the measurement, or neither images nor anchors have
+            spoken clearly for it yet.
     """
 
     T_cam_target: Float | None

@@ -16,8 +16,8 @@ At keyframes the selected anchor competes with the track:
 
 With no refinement supported, the output is what the paper's fusion makes of prediction and anchor, and it coasts. A
 supported output is called TRACKING only if it is beyond doubt as well (``core.confidence``): the image is certain, or a
-second anchor came out close to where the track expected it, or the decoder's lead is large; and no two anchors in a row
-have disagreed since.
+second anchor came out close to where the track expected it, or the decoder's lead is large; some image so far was
+explained well, or three anchors came out close; and no two anchors in a row have disagreed since.
 """
 
 from __future__ import annotations
@@ -39,6 +39,9 @@ from hat_ros.types import Detection, Float, Frame, Motion, Refined, RotationPrio
 
 # An anchor further from where the track expected it than this share of D shares its basin, but bears no witness to it.
 _CLOSE_SHARE = 0.5
+# A wrong pose hardly ever explains an image well, and its lead among other poor ones says little: a track with evidence
+# that never came this far needs so many agreeing anchors, since masks err alike at successive keyframes.
+_EXPLAINED_QUALITY, _WITNESSES = 0.83, 3
 # Measured outputs behind the constant-rate prediction.
 _RATE_HISTORY = 6
 
@@ -71,6 +74,7 @@ class RefinedFusion:
         """Nobody has spoken for or against the track yet, and nothing is known of its predictions."""
         self._attitude.forget()
         self._held: Refined | None = None
+        self._best_quality = 0.0
         self._n_agreed = 0
         self._n_disagreed = 0
         self._forget_rivals()
@@ -261,6 +265,8 @@ class RefinedFusion:
             self._attitude.correct(T[:3, :3], predicted[:3, :3], refined.covariance[3:, 3:])
         else:
             self._attitude.restart(T[:3, :3], refined.covariance[3:, 3:])
+        self._best_quality = max(self._best_quality, quality(refined))
+        explained = self._best_quality >= _EXPLAINED_QUALITY
         # An unknown overlap (NaN) is never certain.
         certain = min(refined.overlap, refined.support) >= self._refinement.certain_share or self._n_agreed > 0
         return Fused(
@@ -269,7 +275,7 @@ class RefinedFusion:
             measurement=T,
             covariance=widened(refined.covariance, refined.misfit_px, self._basin(T)),
             confirmed=certain,
-            doubtful=self._n_disagreed > 1,
+            doubtful=self._n_disagreed > 1 or not (explained or self._n_agreed >= _WITNESSES),
         )
 
     def _basin(self, T_cam_target: Float) -> Float:

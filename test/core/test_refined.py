@@ -184,18 +184,31 @@ def test_weak_evidence_is_no_measurement(scene, evidence):
 
 
 def test_an_uncertain_start_is_tracking_only_after_a_second_anchor_agreed(scene):
-    estimates = _run(_stage(scene, lambda index: {"true": (0.8, 0.8)}), scene, range(30))
+    estimates = _run(_stage(scene, lambda index: {"true": (0.85, 0.85)}), scene, range(30))
     assert [e.state for e in estimates] == [TrackState.COASTING] * 8 + [TrackState.TRACKING] * 22
     assert {e.gap_frames for e in estimates} == {0}
     certain = _run(_stage(scene, lambda index: {"true": (0.95, 0.95)}), scene, range(30))
     assert {e.state for e in certain} == {TrackState.TRACKING}
 
 
+@pytest.mark.parametrize(("explained_at", "tracking_from"), [(None, 24), (4, 4), (12, 12)])
+def test_a_mask_that_was_never_explained_well_needs_three_more_anchors(scene, explained_at, tracking_from):
+    """However far the decoder's lead: a wrong mask errs alike at two keyframes, but no pose explains it well."""
+
+    def evidence(index):
+        return {"true": (0.86, 0.86) if index == explained_at else (0.75, 0.75)}
+
+    estimates = _run(_stage(scene, evidence), scene, range(40), lead=20.0)
+    assert [e.state for e in estimates] == [TrackState.COASTING] * tracking_from + [TrackState.TRACKING] * (
+        40 - tracking_from
+    )
+
+
 @pytest.mark.parametrize(("apart_deg", "believed"), [(5.0, True), (20.0, False)])
 def test_an_anchor_far_from_where_the_track_expected_it_bears_no_witness(scene, apart_deg, believed):
     turn = lie.so3_exp(np.radians([apart_deg, 0.0, 0.0]))
     anchor = lambda i, T: T if i == 0 else lie.transform(turn @ T[:3, :3], T[:3, 3])  # noqa: E731
-    stage = _stage(scene, evidence=lambda index: {"true": (0.7, 0.7)})
+    stage = _stage(scene, evidence=lambda index: {"true": (0.85, 0.85)})
     estimates = _run(stage, scene, range(10), anchor)
     assert (estimates[-1].state == TrackState.TRACKING) == believed
 
