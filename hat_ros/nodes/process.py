@@ -14,7 +14,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from hat_ros.errors import HatError
 from hat_ros.nodes.base import HatNode
-from hat_ros.nodes.environment import keep_large_blocks, prepare_environment
+from hat_ros.nodes.environment import keep_large_blocks, leave_cores_to_stages, prepare_environment
 
 
 class StopRequest:
@@ -62,6 +62,7 @@ def main(node_classes: Sequence[type[HatNode]], args: Sequence[str] | None = Non
     """Entry point of every node process: 0 done, 1 failed, 2 bad input, with one sentence on stderr."""
     prepare_environment()
     keep_large_blocks()
+    leave_cores_to_stages()
     logging.getLogger("hat_ros").setLevel(logging.INFO)
     context = rclpy.Context()
     arguments = list(sys.argv if args is None else args)

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import os
 
+import cv2
 import pytest
 import rclpy
 from rclpy.parameter import Parameter
 
 from hat_ros.config import flat_options
 from hat_ros.errors import ConfigError
-from hat_ros.nodes.environment import PROFILE, RANGE, prepare_environment, profile_path
+from hat_ros.nodes.environment import (
+    OPENCV_THREADS,
+    PROFILE,
+    RANGE,
+    leave_cores_to_stages,
+    prepare_environment,
+    profile_path,
+)
 from hat_ros.nodes.player_node import PlayerNode
 from hat_ros.nodes.selector_node import SelectorNode
 
@@ -104,3 +112,17 @@ def test_environment_defaults_leave_the_user_alone(monkeypatch):
     monkeypatch.setenv(PROFILE, "/mine.xml")
     prepare_environment()
     assert os.environ[PROFILE] == "/mine.xml"
+
+
+def test_nodes_keep_opencv_to_one_thread_unless_the_user_says_otherwise(monkeypatch):
+    before = cv2.getNumThreads()
+    try:
+        cv2.setNumThreads(2)
+        monkeypatch.setenv(OPENCV_THREADS, "2")
+        leave_cores_to_stages()
+        assert cv2.getNumThreads() == 2
+        monkeypatch.delenv(OPENCV_THREADS)
+        leave_cores_to_stages()
+        assert cv2.getNumThreads() == 1
+    finally:
+        cv2.setNumThreads(before)
