@@ -328,6 +328,14 @@ class Refined:
         """(4, 4) pose."""
         return lie.matrix_from_row(self.pose_row)
 
+    @property
+    def quality(self) -> float:
+        """Image evidence for the pose, 0 to 1: mean of contour support and visible silhouette overlap.
+
+        What is black on black speaks neither for nor against it. Without a silhouette mask the contour speaks alone.
+        """
+        return self.support if np.isnan(self.visible_overlap) else 0.5 * (self.support + self.visible_overlap)
+
 
 class TrackState(IntEnum):
     """State of the output, as in the ``state`` column of ``/hat/status``."""

@@ -293,10 +293,5 @@ def is_supported(refined: Refined | None, config: RefinementConfig) -> bool:
 
 
 def quality(refined: Refined | None) -> float:
-    """Image evidence for a pose, 0 to 1: mean of contour support and visible silhouette overlap, 0 for a refused one.
-
-    What is black on black speaks neither for nor against a pose. Without a silhouette mask the contour speaks alone.
-    """
-    if refined is None:
-        return 0.0
-    return refined.support if np.isnan(refined.visible_overlap) else 0.5 * (refined.support + refined.visible_overlap)
+    """Image evidence for a pose, 0 for a refused one."""
+    return 0.0 if refined is None else refined.quality

@@ -17,9 +17,14 @@ from hat_ros.types import Detection, Frame, Refined, RotationPrior
 
 # The mask's robust scales are meant for a target of this size or more and shrink with smaller ones.
 _USUAL_SIZE_PX = 250.0
-# Share of a silhouette that is black on black from which the sun is looked for. Missing less makes a pose a little
-# small and far, which then misses still less: over many frames that adds up.
+# Share of a silhouette that is black on black from which the sun is looked for.
 _SHADOW_SHARE = 0.05
+# Missing less makes a pose a little small and far, which then misses still less: over many frames that adds up. So the
+# sun is looked for as well where the mask shows so much beside the silhouette (with what is black on black, as a share
+# of the silhouette), and not little of what it misses is black.
+_SMALL_SHARE, _BLACK_SHARE = 0.03, 0.2
+# A sunlit contour shorter than this share of the whole one is a stub, which agrees with anything.
+_SUNLIT_SHARE = 1 / 3
 _SCALE_LIMITS = (0.4, 1.0)
 # From a good prediction the fine round alone arrives: this share of the contour agrees, and nothing moved further.
 _ENOUGH_SUPPORT = 0.7
@@ -65,15 +70,27 @@ class FusedPoseRefiner:
         luma = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         prior = prior or RotationPrior(T_cam_target[:3, :3], self._start_information)
         start, view = self._start(frame, field, luma, T_cam_target)
-        fit = None
         if view is not None and field is not None and _lies_in_shadow(field.compare(view, luma)):
-            # Part of the silhouette cannot be seen: find out which, and fit what can.
-            sunlight = self._sun.match(view, LightField(frame.rgb, field.mask))
-            if sunlight is not None:
-                lit = self._viewer.in_sunlight(view, sunlight.to_sun_cam)
-                fit = self._fit_all(frame, field, start, prior, lit, sunlight.to_sun_cam)
-        fit = fit or self._fine(frame, field, start, prior, view) or self._fit_all(frame, field, start, prior, view)
-        if fit is None or not self._same_basin(start, fit.T_cam_target):
+            sunlit = self._fit_sunlit(frame, field, start, prior, view)
+            if sunlit is not None:
+                return self._judged(frame, start, sunlit, field.compare(sunlit.shown, luma))
+        fit = self._fine(frame, field, start, prior, view) or self._fit_all(frame, field, start, prior, view)
+        if fit is None:
+            return None
+        areas = None if field is None else field.compare(fit.shown, luma)
+        refined = self._judged(frame, start, fit, areas)
+        if refined is None or areas is None or not _looks_small(areas):
+            return refined
+        # A pose too small and far hides its own shadow.
+        sunlit = self._fit_sunlit(frame, field, start, prior, view)
+        if sunlit is None or sunlit.outline_px < _SUNLIT_SHARE * fit.outline_px:
+            return refined
+        other = self._judged(frame, start, sunlit, field.compare(sunlit.shown, luma))
+        return other if other is not None and other.quality > refined.quality else refined
+
+    def _judged(self, frame: Frame, start: NDArray[np.float64], fit: Fit, areas: Overlap | None) -> Refined | None:
+        """What a fit is worth by its agreement with the mask; None when it left the basin of its start."""
+        if not self._same_basin(start, fit.T_cam_target):
             return None
         covariance = pose_covariance(fit, self._target.bounding_radius_m)
         if covariance is None:
@@ -81,9 +98,7 @@ class FusedPoseRefiner:
         focal_px = float(frame.camera.K[0, 0])
         covariance = covariance + outline_floor(fit.T_cam_target, focal_px, self._target.bounding_radius_m)
         overlap, visible_overlap, misfit_px = float("nan"), float("nan"), 0.0
-        if field is not None:
-            # The last round starts close to where it ends: its view, shifted, shows what the result looks like.
-            areas = field.compare(fit.view.shifted(fit.shift_px), luma)
+        if areas is not None:
             overlap, visible_overlap = areas.union_share, areas.visible_share
             misfit_px = outline_misfit_px(areas, fit.outline_px)
         return Refined(
@@ -120,6 +135,16 @@ class FusedPoseRefiner:
         # The view is the start's.
         return fit if np.hypot(*fit.shift_px) + fit.twist_px <= _SMALL_MOVE_PX else None
 
+    def _fit_sunlit(
+        self, frame: Frame, field: MaskField, start: NDArray[np.float64], prior: RotationPrior, view: View
+    ) -> Fit | None:
+        """All rounds with the contour of what the sun shines on; None where no sun explains the image."""
+        sunlight = self._sun.match(view, LightField(frame.rgb, field.mask))
+        if sunlight is None:
+            return None
+        lit = self._viewer.in_sunlight(view, sunlight.to_sun_cam)
+        return self._fit_all(frame, field, start, prior, lit, sunlight.to_sun_cam)
+
     def _fit_all(
         self,
         frame: Frame,
@@ -150,3 +175,9 @@ class FusedPoseRefiner:
 def _lies_in_shadow(areas: Overlap) -> bool:
     """Whether much of a silhouette is missing from the mask before black."""
     return areas.hidden > _SHADOW_SHARE * (areas.common + areas.hidden + areas.missing)
+
+
+def _looks_small(areas: Overlap) -> bool:
+    """Whether the mask reaches beyond a silhouette some of which lies before black."""
+    small = areas.hidden + areas.extra > _SMALL_SHARE * (areas.common + areas.hidden + areas.missing)
+    return small and areas.hidden > _BLACK_SHARE * areas.missing

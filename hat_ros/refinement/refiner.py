@@ -79,6 +79,11 @@ class Fit:
     twist_px: float
 
     @property
+    def shown(self) -> View:
+        """What the result looks like: the last round started close to where it ended, so its view is only shifted."""
+        return self.view.shifted(self.shift_px)
+
+    @property
     def outline_px(self) -> float:
         """Length of the outline inside the image, pixels."""
         return float(self.lines[self.contour[:, 0] > 0, 2].sum())

@@ -59,17 +59,27 @@ def test_what_lies_in_shadow_does_not_drag_the_pose(refiner, target, seed):
     assert shift < 0.02
 
 
-def test_a_dark_rim_makes_no_round_body_small_and_far_frame_after_frame():
-    barrel = trimesh.creation.cylinder(0.5, 1.6)
+@pytest.fixture(scope="module")
+def barrel():
+    """A round body, with a box that gives it a front."""
+    tube = trimesh.creation.cylinder(0.5, 1.6)
     box = trimesh.creation.box((0.5, 0.4, 0.3), transform=lie.transform(np.eye(3), [0.45, 0.0, 0.7]))
-    for mesh in (barrel, box):
+    for mesh in (tube, box):
         mesh.visual.face_colors = np.tile([170, 170, 170, 255], (len(mesh.faces), 1))
-    target = target_from_scene(trimesh.Scene([barrel, box]), "barrel")
-    T_true = random_pose(np.random.default_rng(6), target)
-    frame, silhouette = sunlit_picture(target, T_true, (-1.0, 0.3, -1.0))
+    return target_from_scene(trimesh.Scene([tube, box]), "barrel")
+
+
+@pytest.mark.parametrize(
+    ("to_sun", "in_shadow", "start"), [((-1.0, 0.3, -1.0), (0.1, 0.2), 1.0), ((0.8, 0.2, -1.2), (0.04, 0.08), 1.03)]
+)
+def test_a_dark_rim_makes_no_round_body_small_and_far_frame_after_frame(barrel, to_sun, in_shadow, start):
+    """Nor does it stay so once it is: a pose too small and far misses less of its shadow than there is."""
+    T_true = random_pose(np.random.default_rng(6), barrel)
+    frame, silhouette = sunlit_picture(barrel, T_true, to_sun)
     lit = silhouette & (frame.rgb.max(axis=2) > 12)
-    assert 0.1 < 1.0 - lit.sum() / silhouette.sum() < 0.2
-    refiner, T = create_refiner(ENABLED, target), T_true
+    assert in_shadow[0] < 1.0 - lit.sum() / silhouette.sum() < in_shadow[1]
+    refiner, T = create_refiner(ENABLED, barrel), T_true.copy()
+    T[:3, 3] *= start
     for _ in range(10):
         T = refiner.refine(frame, Detection(lit), T).T_cam_target
     assert pose_errors(T, T_true)[0] < 2.0
