@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from hat_ros.config import HatConfig
 from hat_ros.core.guard import guard_candidates
 from hat_ros.core.keyframes import KeyframeSchedule
 from hat_ros.stages import create_backend
 from hat_ros.target import Target
-from hat_ros.types import Candidates, Detection, Frame, PosePrior
+from hat_ros.types import Candidates, Detection, Float, Frame, PosePrior
+
+# Intersection over union below which two boxes do not hold the same thing.
+_SAME_BOX_OVERLAP = 0.5
 
 
 class HypothesisStage:
@@ -24,6 +29,7 @@ class HypothesisStage:
         self._schedule = KeyframeSchedule(config.keyframes)
         self._apart_deg, self._min_lead = config.fusion.gate_angle_deg, config.refinement.min_margin
         self._backend = create_backend("hypotheses", config, target)
+        self._tried_xyxy: Float | None = None
 
     def update(self, frame: Frame, detection: Detection | None, prior: PosePrior | None) -> Candidates:
         """Candidates of one frame, best first; zero rows between keyframes and without a detection.
@@ -32,8 +38,10 @@ class HypothesisStage:
             CandidateError: the backend returned a score or pose that is not finite and ``hypotheses.guard`` is off.
         """
         healthy = prior is not None and prior.healthy
-        if not self._schedule.update(detection is not None, healthy) or detection is None:
+        in_vain = not healthy and detection is not None and self._is_elsewhere(detection)
+        if not self._schedule.update(detection is not None, healthy, in_vain) or detection is None:
             return Candidates.none()
+        self._tried_xyxy = detection.box_xyxy
         candidates = self._backend.generate(frame, detection, prior)
         if len(candidates) > self._max_candidates:
             keep = slice(self._max_candidates)
@@ -46,3 +54,17 @@ class HypothesisStage:
         """Forget earlier frames; the next frame with a detection is a keyframe."""
         self._schedule.reset()
         self._backend.reset()
+        self._tried_xyxy = None
+
+    def _is_elsewhere(self, detection: Detection) -> bool:
+        """Whether hardly the same box was tried last: a mask of a part, or of something else."""
+        tried = self._tried_xyxy
+        return tried is not None and box_overlap(tried, detection.box_xyxy) < _SAME_BOX_OVERLAP
+
+
+def box_overlap(a: Float, b: Float) -> float:
+    """Intersection over union of two boxes (4,) ``x0, y0, x1, y1``."""
+    width, height = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
+    common = max(width, 0.0) * max(height, 0.0)
+    area_a, area_b = np.prod(a[2:] - a[:2]), np.prod(b[2:] - b[:2])
+    return float(common / (area_a + area_b - common))

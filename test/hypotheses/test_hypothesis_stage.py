@@ -1,0 +1,50 @@
+"""When the stage asks its backend, and on what."""
+
+import numpy as np
+import pytest
+
+from hat_ros.config import HatConfig, KeyframeConfig
+from hat_ros.hypotheses import stage as hypothesis_stage
+from hat_ros.hypotheses.stage import HypothesisStage, box_overlap
+from hat_ros.types import Camera, Candidates, Detection, Frame
+
+CAMERA = Camera(np.array([[200.0, 0, 32], [0, 200.0, 32], [0, 0, 1]]), 64, 64)
+DECIDED = Candidates(np.array([[0, 0, 5, 0, 0, 0, 1.0]]), np.zeros(1), np.array([8.0, 8, 40, 40]))
+
+
+class _Backend:
+    def generate(self, frame, detection, prior):
+        return DECIDED
+
+    def reset(self):
+        pass
+
+
+def _detection(left, right):
+    mask = np.zeros((64, 64), np.bool_)
+    mask[8:40, left:right] = True
+    return Detection(mask)
+
+
+def _asked(monkeypatch, detections):
+    monkeypatch.setattr(hypothesis_stage, "create_backend", lambda *_: _Backend())
+    stage = HypothesisStage(HatConfig(keyframes=KeyframeConfig(gap_frames=6, settled_factor=3)), None)
+    image = np.zeros((64, 64, 3), np.uint8)
+    frames = [Frame(i + 1, image, CAMERA) for i in range(len(detections))]
+    asked = [len(stage.update(f, d, None)) > 0 for f, d in zip(frames, detections, strict=True)]
+    return np.flatnonzero(asked).tolist()
+
+
+def test_a_start_on_a_part_of_the_target_is_tried_again_once_all_of_it_is_found(monkeypatch):
+    part, whole = _detection(8, 20), _detection(8, 40)
+    assert _asked(monkeypatch, [part] + 11 * [whole]) == [0, 2, 8]
+    assert _asked(monkeypatch, 12 * [whole]) == [0, 6]
+    assert _asked(monkeypatch, 7 * [whole] + 7 * [part]) == [0, 6, 12]  # only the start is so urgent
+
+
+@pytest.mark.parametrize(
+    ("box", "overlap"), [((0, 0, 4, 4), 1.0), ((2, 0, 6, 4), 1 / 3), ((4, 0, 8, 4), 0.0), ((1, 1, 3, 3), 0.25)]
+)
+def test_the_overlap_of_boxes(box, overlap):
+    a, b = np.array([0.0, 0, 4, 4]), np.array(box, dtype=np.float64)
+    assert box_overlap(a, b) == box_overlap(b, a) == pytest.approx(overlap)
