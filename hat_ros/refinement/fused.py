@@ -23,8 +23,8 @@ _SHADOW_SHARE = 0.05
 # sun is looked for as well where the mask shows so much beside the silhouette (with what is black on black, as a share
 # of the silhouette), and not little of what it misses is black.
 _SMALL_SHARE, _BLACK_SHARE = 0.03, 0.2
-# A sunlit contour shorter than this share of the whole one is a stub, which agrees with anything.
-_SUNLIT_SHARE = 1 / 3
+# A sunlit contour is a stub, which agrees with anything, where silhouette and mask disagree by so many pixels along it.
+_STUB_MISFIT_PX = 5.0
 _SCALE_LIMITS = (0.4, 1.0)
 # From a good prediction the fine round alone arrives: this share of the contour agrees, and nothing moved further.
 _ENOUGH_SUPPORT = 0.7
@@ -71,9 +71,9 @@ class FusedPoseRefiner:
         prior = prior or RotationPrior(T_cam_target[:3, :3], self._start_information)
         start, view = self._start(frame, field, luma, T_cam_target)
         if view is not None and field is not None and _lies_in_shadow(field.compare(view, luma)):
-            sunlit = self._fit_sunlit(frame, field, start, prior, view)
+            sunlit = self._sunlit(frame, field, luma, start, prior, view)
             if sunlit is not None:
-                return self._judged(frame, start, sunlit, field.compare(sunlit.shown, luma))
+                return sunlit
         fit = self._fine(frame, field, start, prior, view) or self._fit_all(frame, field, start, prior, view)
         if fit is None:
             return None
@@ -82,11 +82,28 @@ class FusedPoseRefiner:
         if refined is None or areas is None or not _looks_small(areas):
             return refined
         # A pose too small and far hides its own shadow.
-        sunlit = self._fit_sunlit(frame, field, start, prior, view)
-        if sunlit is None or sunlit.outline_px < _SUNLIT_SHARE * fit.outline_px:
-            return refined
-        other = self._judged(frame, start, sunlit, field.compare(sunlit.shown, luma))
-        return other if other is not None and other.quality > refined.quality else refined
+        sunlit = self._sunlit(frame, field, luma, start, prior, view)
+        return sunlit if sunlit is not None and sunlit.quality > refined.quality else refined
+
+    def _sunlit(
+        self,
+        frame: Frame,
+        field: MaskField,
+        luma: NDArray[np.uint8],
+        start: NDArray[np.float64],
+        prior: RotationPrior,
+        view: View,
+    ) -> Refined | None:
+        """Refined by the contour of what the sun shines on; None where that is hardly anything, or no sun is found."""
+        sunlight = self._sun.match(view, LightField(frame.rgb, field.mask))
+        if sunlight is None:
+            return None
+        lit = self._viewer.in_sunlight(view, sunlight.to_sun_cam)
+        fit = self._fit_all(frame, field, start, prior, lit, sunlight.to_sun_cam)
+        if fit is None:
+            return None
+        refined = self._judged(frame, start, fit, field.compare(fit.shown, luma))
+        return refined if refined is not None and refined.misfit_px <= _STUB_MISFIT_PX else None
 
     def _judged(self, frame: Frame, start: NDArray[np.float64], fit: Fit, areas: Overlap | None) -> Refined | None:
         """What a fit is worth by its agreement with the mask; None when it left the basin of its start."""
@@ -134,16 +151,6 @@ class FusedPoseRefiner:
             return None
         # The view is the start's.
         return fit if np.hypot(*fit.shift_px) + fit.twist_px <= _SMALL_MOVE_PX else None
-
-    def _fit_sunlit(
-        self, frame: Frame, field: MaskField, start: NDArray[np.float64], prior: RotationPrior, view: View
-    ) -> Fit | None:
-        """All rounds with the contour of what the sun shines on; None where no sun explains the image."""
-        sunlight = self._sun.match(view, LightField(frame.rgb, field.mask))
-        if sunlight is None:
-            return None
-        lit = self._viewer.in_sunlight(view, sunlight.to_sun_cam)
-        return self._fit_all(frame, field, start, prior, lit, sunlight.to_sun_cam)
 
     def _fit_all(
         self,

@@ -7,6 +7,7 @@ from shape_scene import CAMERA, picture, pose_errors, random_pose, spacecraft, s
 from hat_ros import lie
 from hat_ros.config import HatConfig, RefinementConfig
 from hat_ros.refinement import create_refiner
+from hat_ros.refinement.sunlight import Sunlight, SunMatcher
 from hat_ros.target import target_from_scene
 from hat_ros.types import Detection, Frame, RotationPrior
 
@@ -84,6 +85,21 @@ def test_a_dark_rim_makes_no_round_body_small_and_far_frame_after_frame(barrel, 
         T = refiner.refine(frame, Detection(lit), T).T_cam_target
     assert pose_errors(T, T_true)[0] < 2.0
     assert T[2, 3] / T_true[2, 3] == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize(("seed", "to_sun"), [(1, (-0.5, 0.2, 1.0)), (5, (0.0, 0.3, 1.0)), (6, (0.0, 0.3, 1.0))])
+def test_a_sun_that_lights_hardly_any_contour_is_not_believed(refiner, target, monkeypatch, seed, to_sun):
+    T_true = random_pose(np.random.default_rng(seed), target)
+    frame, mask = picture(target, T_true)
+    unlit = mask & (np.cumsum(mask.sum(axis=0)) < 0.1 * mask.sum())  # its left tenth, black on black
+    rgb = frame.rgb.copy()
+    rgb[unlit] = 0
+    monkeypatch.setattr(SunMatcher, "match", lambda *_: Sunlight(0.0, np.array(to_sun)))
+    start = lie.transform(lie.so3_exp([0.02, 0.018, 0.022]) @ T_true[:3, :3], 1.01 * T_true[:3, 3])
+    refined = refiner.refine(Frame(frame.stamp_ns, rgb, frame.camera), Detection(mask & ~unlit), start)
+    turn, shift = pose_errors(refined.T_cam_target, T_true)
+    assert turn < 1.0
+    assert shift < 0.005
 
 
 @pytest.mark.parametrize("wide", [False, True])
