@@ -87,7 +87,7 @@ def test_a_dark_rim_makes_no_round_body_small_and_far_frame_after_frame(barrel, 
     assert T[2, 3] / T_true[2, 3] == pytest.approx(1.0, abs=0.02)
 
 
-@pytest.mark.parametrize(("seed", "to_sun"), [(1, (-0.5, 0.2, 1.0)), (5, (0.0, 0.3, 1.0)), (6, (0.0, 0.3, 1.0))])
+@pytest.mark.parametrize(("seed", "to_sun"), [(1, (-0.5, 0.2, 1.0)), (5, (0.0, 0.3, 1.0))])
 def test_a_sun_that_lights_hardly_any_contour_is_not_believed(refiner, target, monkeypatch, seed, to_sun):
     T_true = random_pose(np.random.default_rng(seed), target)
     frame, mask = picture(target, T_true)
