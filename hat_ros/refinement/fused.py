@@ -70,7 +70,8 @@ class FusedPoseRefiner:
         luma = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
         prior = prior or RotationPrior(T_cam_target[:3, :3], self._start_information)
         start, view = self._start(frame, field, luma, T_cam_target)
-        if view is not None and field is not None and _lies_in_shadow(field.compare(view, luma)):
+        in_shadow = view is not None and field is not None and _lies_in_shadow(field.compare(view, luma))
+        if in_shadow:
             sunlit = self._sunlit(frame, field, luma, start, prior, view)
             if sunlit is not None:
                 return sunlit
@@ -79,7 +80,7 @@ class FusedPoseRefiner:
             return None
         areas = None if field is None else field.compare(fit.shown, luma)
         refined = self._judged(frame, start, fit, areas)
-        if refined is None or areas is None or not _looks_small(areas):
+        if in_shadow or refined is None or areas is None or not _looks_small(areas):
             return refined
         # A pose too small and far hides its own shadow.
         sunlit = self._sunlit(frame, field, luma, start, prior, view)
