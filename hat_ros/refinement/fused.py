@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,7 @@ from hat_ros.types import Detection, Frame, Refined, RotationPrior
 
 # The mask's robust scales are meant for a target of this size or more and shrink with smaller ones.
 _USUAL_SIZE_PX = 250.0
+_SCALE_LIMITS = (0.4, 1.0)
 # Share of a silhouette that is black on black from which the sun is looked for.
 _SHADOW_SHARE = 0.05
 # Missing less makes a pose a little small and far, which then misses still less: over many frames that adds up. So the
@@ -25,10 +28,33 @@ _SHADOW_SHARE = 0.05
 _SMALL_SHARE, _BLACK_SHARE = 0.03, 0.2
 # A sunlit contour is a stub, which agrees with anything, where silhouette and mask disagree by so many pixels along it.
 _STUB_MISFIT_PX = 5.0
-_SCALE_LIMITS = (0.4, 1.0)
 # From a good prediction the fine round alone arrives: this share of the contour agrees, and nothing moved further.
 _ENOUGH_SUPPORT = 0.7
 _SMALL_MOVE_PX = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """A pose to refine on an image.
+
+    Attributes:
+        frame, luma: the image, and (H, W) the same in grey.
+        field: the mask, None without a silhouette.
+        prior: what is known of the rotation.
+        start: (4, 4) pose to start from.
+        view: what the target looks like there, None when it is out of view.
+    """
+
+    frame: Frame
+    luma: NDArray[np.uint8]
+    field: MaskField | None
+    prior: RotationPrior
+    start: NDArray[np.float64]
+    view: View | None
+
+    def areas(self, view: View | None) -> Overlap | None:
+        """Agreement of mask and view, None without one of them."""
+        return None if self.field is None or view is None else self.field.compare(view, self.luma)
 
 
 class FusedPoseRefiner:
@@ -66,54 +92,65 @@ class FusedPoseRefiner:
             The refined pose with its uncertainty, or None when the target is out of view, nothing in the image can be
             measured, or the refinement would leave the basin.
         """
-        field = MaskField(detection.mask) if detection is not None and detection.silhouette else None
-        luma = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        prior = prior or RotationPrior(T_cam_target[:3, :3], self._start_information)
-        start, view = self._start(frame, field, luma, T_cam_target)
-        in_shadow = view is not None and field is not None and _lies_in_shadow(field.compare(view, luma))
+        task = self._task(frame, detection, T_cam_target, prior)
+        at_start = task.areas(task.view)
+        in_shadow = at_start is not None and _lies_in_shadow(at_start)
         if in_shadow:
-            sunlit = self._sunlit(frame, field, luma, start, prior, view)
+            sunlit = self._sunlit(task)
             if sunlit is not None:
                 return sunlit
-        fit = self._fine(frame, field, start, prior, view) or self._fit_all(frame, field, start, prior, view)
+        fit = self._fine(task) or self._fit_all(task, task.view)
         if fit is None:
             return None
-        areas = None if field is None else field.compare(fit.shown, luma)
-        refined = self._judged(frame, start, fit, areas)
+        areas = task.areas(fit.shown)
+        refined = self._judged(task, fit, areas)
         if in_shadow or refined is None or areas is None or not _looks_small(areas):
             return refined
         # A pose too small and far hides its own shadow.
-        sunlit = self._sunlit(frame, field, luma, start, prior, view)
+        sunlit = self._sunlit(task)
         return sunlit if sunlit is not None and sunlit.quality > refined.quality else refined
 
-    def _sunlit(
+    def reset(self) -> None:
+        """Nothing to forget: every frame stands for itself."""
+
+    def _task(
         self,
         frame: Frame,
-        field: MaskField,
-        luma: NDArray[np.uint8],
-        start: NDArray[np.float64],
-        prior: RotationPrior,
-        view: View,
-    ) -> Refined | None:
+        detection: Detection | None,
+        T_cam_target: NDArray[np.float64],
+        prior: RotationPrior | None,
+    ) -> _Task:
+        """The start is centred on the mask if need be."""
+        field = MaskField(detection.mask) if detection is not None and detection.silhouette else None
+        luma = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+        prior = prior or RotationPrior(T_cam_target[:3, :3], self._start_information)
+        start, view = T_cam_target, self._viewer.view(T_cam_target, frame.camera, self._config.render_px)
+        if view is not None and field is not None:
+            start = self._fitter.centred(T_cam_target, frame.camera, field, luma, view)
+            if start is not T_cam_target:
+                view = self._viewer.view(start, frame.camera, self._config.render_px)
+        return _Task(frame, luma, field, prior, start, view)
+
+    def _sunlit(self, task: _Task) -> Refined | None:
         """Refined by the contour of what the sun shines on; None where that is hardly anything, or no sun is found."""
-        sunlight = self._sun.match(view, LightField(frame.rgb, field.mask))
+        sunlight = self._sun.match(task.view, LightField(task.frame.rgb, task.field.mask))
         if sunlight is None:
             return None
-        lit = self._viewer.in_sunlight(view, sunlight.to_sun_cam)
-        fit = self._fit_all(frame, field, start, prior, lit, sunlight.to_sun_cam)
+        lit = self._viewer.in_sunlight(task.view, sunlight.to_sun_cam)
+        fit = self._fit_all(task, lit, sunlight.to_sun_cam)
         if fit is None:
             return None
-        refined = self._judged(frame, start, fit, field.compare(fit.shown, luma))
+        refined = self._judged(task, fit, task.areas(fit.shown))
         return refined if refined is not None and refined.misfit_px <= _STUB_MISFIT_PX else None
 
-    def _judged(self, frame: Frame, start: NDArray[np.float64], fit: Fit, areas: Overlap | None) -> Refined | None:
+    def _judged(self, task: _Task, fit: Fit, areas: Overlap | None) -> Refined | None:
         """What a fit is worth by its agreement with the mask; None when it left the basin of its start."""
-        if not self._same_basin(start, fit.T_cam_target):
+        if not self._same_basin(task.start, fit.T_cam_target):
             return None
         covariance = pose_covariance(fit, self._target.bounding_radius_m)
         if covariance is None:
             return None
-        focal_px = float(frame.camera.K[0, 0])
+        focal_px = float(task.frame.camera.K[0, 0])
         covariance = covariance + outline_floor(fit.T_cam_target, focal_px, self._target.bounding_radius_m)
         overlap, visible_overlap, misfit_px = float("nan"), float("nan"), 0.0
         if areas is not None:
@@ -123,54 +160,24 @@ class FusedPoseRefiner:
             lie.row_from_matrix(fit.T_cam_target), covariance, overlap, fit.support, visible_overlap, misfit_px
         )
 
-    def _start(
-        self, frame: Frame, field: MaskField | None, luma: NDArray[np.uint8], T_cam_target: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], View | None]:
-        """Where to start from, centred on the mask if need be, and what the target looks like there."""
-        view = self._viewer.view(T_cam_target, frame.camera, self._config.render_px)
-        if view is None or field is None:
-            return T_cam_target, view
-        start = self._fitter.centred(T_cam_target, frame.camera, field, luma, view)
-        if start is not T_cam_target:
-            view = self._viewer.view(start, frame.camera, self._config.render_px)
-        return start, view
-
-    def _fine(
-        self,
-        frame: Frame,
-        field: MaskField | None,
-        start: NDArray[np.float64],
-        prior: RotationPrior,
-        view: View | None,
-    ) -> Fit | None:
+    def _fine(self, task: _Task) -> Fit | None:
         """The finest round alone; None unless that explains the image and hardly moves the start."""
-        if field is None or view is None:
+        frame, view = task.frame, task.view
+        if task.field is None or view is None:
             return None
-        rounds = WITH_MASK[-1:]
-        fit = self._fitter.fit(start, frame.camera, frame.rgb, field, rounds, prior, view=view)
+        fit = self._fitter.fit(task.start, frame.camera, frame.rgb, task.field, WITH_MASK[-1:], task.prior, view=view)
         if fit.support < _ENOUGH_SUPPORT:
             return None
         # The view is the start's.
         return fit if np.hypot(*fit.shift_px) + fit.twist_px <= _SMALL_MOVE_PX else None
 
-    def _fit_all(
-        self,
-        frame: Frame,
-        field: MaskField | None,
-        start: NDArray[np.float64],
-        prior: RotationPrior,
-        view: View | None,
-        to_sun_cam: NDArray[np.float64] | None = None,
-    ) -> Fit | None:
-        """All rounds, from the widest to the finest."""
-        rounds = WITHOUT_MASK
+    def _fit_all(self, task: _Task, view: View | None, to_sun_cam: NDArray[np.float64] | None = None) -> Fit | None:
+        """All rounds, from the widest to the finest, with a view of the start, all or its sunlit part."""
+        frame, field, rounds = task.frame, task.field, WITHOUT_MASK
         if field is not None:
             factor = float(np.clip(field.size_px / _USUAL_SIZE_PX, *_SCALE_LIMITS))
             rounds = (WITH_MASK[0].scaled(factor), *WITH_MASK[1:])
-        return self._fitter.fit(start, frame.camera, frame.rgb, field, rounds, prior, to_sun_cam, view)
-
-    def reset(self) -> None:
-        """Nothing to forget: every frame stands for itself."""
+        return self._fitter.fit(task.start, frame.camera, frame.rgb, field, rounds, task.prior, to_sun_cam, view)
 
     def _same_basin(self, T_before: NDArray[np.float64], T_after: NDArray[np.float64]) -> bool:
         turn = np.degrees(lie.angle_between(T_before[:3, :3], T_after[:3, :3]))
