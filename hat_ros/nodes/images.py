@@ -20,6 +20,9 @@ UInt8 = NDArray[np.uint8]
 
 SILHOUETTE = 255
 BOX = 128
+# 1 for all values that a mask may not hold: looked up five times faster than compared.
+_NO_MASK_VALUE = np.ones(256, np.uint8)
+_NO_MASK_VALUE[[0, BOX, SILHOUETTE]] = 0
 
 # encoding -> (channels, cv2 conversion to RGB or None). A ROS Bayer name gives the first two pixels of the first row,
 # an OpenCV one those of the second row from the second column on: hence the crossed pairs.
@@ -74,7 +77,7 @@ def decode_mask(message: Any) -> UInt8 | None:
     if message.encoding not in ("mono8", "8UC1"):
         raise FrameError(f"detection mask must be mono8, found '{message.encoding}'")
     mask = np.ascontiguousarray(pixels_of(message, 1)[..., 0])
-    if not np.isin(mask, (0, BOX, SILHOUETTE)).all():
+    if cv2.LUT(mask, _NO_MASK_VALUE).any():
         raise FrameError(f"detection mask may hold 0, {BOX} (box) and {SILHOUETTE} (silhouette) only")
     return mask
 
