@@ -43,9 +43,10 @@ from hat_ros.hypotheses.matching import (
     whole_placement,
 )
 from hat_ros.hypotheses.scoring import Scorer, light_score, log_score, shape_score
+from hat_ros.refinement.mask_field import MaskField
 from hat_ros.refinement.refiner import PoseFitter, Schedule
 from hat_ros.refinement.sunlight import SunMatcher
-from hat_ros.refinement.view import MaskField, TargetViewer
+from hat_ros.refinement.view import TargetViewer
 from hat_ros.render import create_renderer
 from hat_ros.target import Target
 from hat_ros.types import Camera, Candidates, Detection, Frame, PosePrior

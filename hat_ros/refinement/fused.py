@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from hat_ros import lie
 from hat_ros.config import RefinementConfig
 from hat_ros.refinement.covariance import outline_floor, outline_misfit_px, pose_covariance
+from hat_ros.refinement.mask_field import MaskField, Overlap
 from hat_ros.refinement.refiner import WITH_MASK, WITHOUT_MASK, Fit, PoseFitter
 from hat_ros.refinement.sunlight import LightField, SunMatcher
-from hat_ros.refinement.view import MaskField, Overlap, TargetViewer, View
+from hat_ros.refinement.view import TargetViewer, View
 from hat_ros.target import Target
 from hat_ros.types import Detection, Frame, Refined, RotationPrior
 

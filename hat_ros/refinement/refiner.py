@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hat_ros import lie
+from hat_ros.refinement.mask_field import MaskField
 from hat_ros.refinement.solver import fit_contour
-from hat_ros.refinement.view import MaskField, TargetViewer, View, contour_lines
+from hat_ros.refinement.view import TargetViewer, View, contour_lines
 from hat_ros.types import Camera, Frame, RotationPrior
 
 _NO_DISTANCE = np.zeros((2, 2), np.float32)

@@ -11,6 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hat_ros.linear import cholesky_in_place, cholesky_solve, product, rotation
+
 Array = NDArray[np.float64]
 
 # Lines with less free target or background than this have no colour of their own to compare.
@@ -27,73 +29,10 @@ CORRELATION_PX = 8.0
 CORRELATION_SHARE = 0.03
 # Errors common to a whole outline, one sigma in pixels: a mask drawn too large, an exposure that blooms. They are
 # estimated along with the pose.
-MASK_BIAS_PX = 1.0
-EDGE_BIAS_PX = 0.15
-# Pose parameters, then the two biases.
+BIAS_PX = (1.0, 0.15)
+# The two kinds of residuals; pose parameters, then a bias of each kind.
+MASK, EDGE = 0, 1
 N_PARAMETERS = 8
-MASK_BIAS, EDGE_BIAS = 6, 7
-
-
-@njit(cache=True, nogil=True)
-def cholesky_solve(A: Array, b: Array) -> tuple[bool, Array]:
-    """Solve the symmetric positive definite system ``A x = b`` of any small size; False when A is not."""
-    n = A.shape[0]
-    L = np.zeros((n, n))
-    x = np.zeros(n)
-    for i in range(n):
-        for j in range(i + 1):
-            s = A[i, j]
-            for k in range(j):
-                s -= L[i, k] * L[j, k]
-            if i == j:
-                if s <= 1e-300:
-                    return False, x
-                L[i, i] = np.sqrt(s)
-            else:
-                L[i, j] = s / L[j, j]
-    for i in range(n):
-        s = b[i]
-        for k in range(i):
-            s -= L[i, k] * x[k]
-        x[i] = s / L[i, i]
-    for i in range(n - 1, -1, -1):
-        s = x[i]
-        for k in range(i + 1, n):
-            s -= L[k, i] * x[k]
-        x[i] = s / L[i, i]
-    return True, x
-
-
-@njit(cache=True, nogil=True)
-def rotation_exp(r: Array) -> Array:
-    """(3, 3) rotation of a rotation vector (Rodrigues)."""
-    angle_sq = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]
-    if angle_sq < 1e-8:
-        a, b = 1.0 - angle_sq / 6.0, 0.5 - angle_sq / 24.0
-    else:
-        angle = np.sqrt(angle_sq)
-        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle_sq
-    K = np.array([[0.0, -r[2], r[1]], [r[2], 0.0, -r[0]], [-r[1], r[0], 0.0]])
-    R = np.zeros((3, 3))
-    for i in range(3):
-        for j in range(3):
-            s = 0.0
-            for k in range(3):
-                s += K[i, k] * K[k, j]
-            R[i, j] = a * K[i, j] + b * s
-        R[i, i] += 1.0
-    return R
-
-
-@njit(cache=True, nogil=True)
-def _update_pose(R: Array, t: Array, step: Array) -> tuple[Array, Array]:
-    dR = rotation_exp(step[3:6])
-    out = np.zeros((3, 3))
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                out[i, j] += dR[i, k] * R[k, j]
-    return out, t + step[:3]
 
 
 @njit(cache=True, nogil=True)
@@ -122,28 +61,29 @@ def _normal_row(
 
 
 @njit(cache=True, nogil=True)
-def _accumulate(H: Array, g: Array, row: Array, weight: float, residual: float) -> None:
-    """Add one weighted residual with derivative row to the normal equations (lower triangle)."""
+def _accumulate(
+    kind: int, H: Array, g: Array, squares: Array, weights: Array, row: Array, weight: float, residual: float
+) -> None:
+    """Add one weighted residual with derivative row to the normal equations of its kind (lower triangle)."""
     for i in range(len(row)):
-        g[i] -= weight * row[i] * residual
+        g[kind, i] -= weight * row[i] * residual
         for j in range(i + 1):
-            H[i, j] += weight * row[i] * row[j]
+            H[kind, i, j] += weight * row[i] * row[j]
+    squares[kind] += weight * residual * residual
+    weights[kind] += weight
 
 
 @njit(cache=True, nogil=True)
-def _damped_solve(H: Array, g: Array, damping: float, radius_m: float) -> tuple[bool, Array]:
+def _damped_step(H: Array, g: Array, damping: float, radius_m: float) -> tuple[bool, Array]:
     """Step of the pose and the biases; damping is a share of the mean translational information."""
-    n = len(g)
-    A = np.empty((n, n))
-    for i in range(n):
-        for j in range(i + 1):
-            A[i, j] = H[i, j]
-            A[j, i] = H[i, j]
     level = (H[0, 0] + H[1, 1] + H[2, 2]) / 3.0 * damping + 1e-12
+    L = H.copy()
     for i in range(3):
-        A[i, i] += level
-        A[i + 3, i + 3] += level * radius_m * radius_m
-    return cholesky_solve(A, g)
+        L[i, i] += level
+        L[i + 3, i + 3] += level * radius_m * radius_m
+    if not cholesky_in_place(L):
+        return False, g
+    return True, cholesky_solve(L, g)
 
 
 @njit(cache=True, nogil=True)
@@ -235,9 +175,71 @@ def edge_offset(
 
 
 @njit(cache=True, nogil=True)
-def _mean_square(total: float, weight: float, floor: float) -> float:
-    """Weighted mean square residual, not below floor."""
-    return max(total / weight, floor) if weight > 0.0 else floor
+def _add_residuals(
+    points: Array, lines: Array, R: Array, t: Array, K: Array, image: NDArray[np.uint8], reach_px: float,
+    distance: NDArray[np.float32], origin: Array, scales_px: Array, biases: Array,
+    H: Array, g: Array, squares: Array, weights: Array, state: Array,
+) -> None:  # fmt: skip
+    """Normal equations of mask and edges at a pose, one after the other.
+
+    Adds to H (2, 8, 8), g (2, 8) and to the weighted sums of squared residuals (2,) and of weights (2,); writes what is
+    found of each point into state (N, 5). See :func:`fit_contour`.
+    """
+    row, mask_at = np.zeros(N_PARAMETERS), np.empty(3)
+    profile, levels = np.empty((64, 3)), np.empty(64)
+    mask_sq, edge_sq = scales_px[MASK] ** 2, scales_px[EDGE] ** 2
+    spacing = max(reach_px / 8.0, 0.5)
+    height, width = image.shape[0], image.shape[1]
+    for i in range(len(points)):
+        p = points[i]
+        x = R[0, 0] * p[0] + R[0, 1] * p[1] + R[0, 2] * p[2] + t[0]
+        y = R[1, 0] * p[0] + R[1, 1] * p[1] + R[1, 2] * p[2] + t[1]
+        z = R[2, 0] * p[0] + R[2, 1] * p[1] + R[2, 2] * p[2] + t[2]
+        if z <= 1e-6:
+            continue
+        u, v = (K[0, 0] * x + K[0, 1] * y) / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+        if u < 1.0 or v < 1.0 or u > width - 2.0 or v > height - 2.0:
+            continue
+        state[i, 0] = 1.0
+        if mask_sq > 0.0:
+            _mask_distance(distance, u - origin[0], v - origin[1], mask_at)
+            residual = mask_at[0] - biases[MASK]
+            robust = (mask_sq / (mask_sq + residual * residual)) ** 2
+            state[i, 1], state[i, 2] = mask_at[0], robust
+            _normal_row(x, y, z, t[0], t[1], t[2], K[0, 0], K[1, 1], mask_at[1], mask_at[2], row)
+            row[6 + MASK], row[6 + EDGE] = -1.0, 0.0
+            _accumulate(MASK, H, g, squares, weights, row, lines[i, 2] * robust, residual)
+        inside, outside = min(reach_px, lines[i, 3]), min(reach_px, lines[i, 4])
+        if inside < MIN_REACH_PX or outside < MIN_REACH_PX:
+            continue
+        nu, nv = lines[i, 0], lines[i, 1]
+        offset, quality = edge_offset(image, u, v, nu, nv, inside, outside, spacing, profile, levels)
+        if quality <= 0.0:
+            continue
+        residual = -offset - biases[EDGE]
+        robust = quality * (edge_sq / (edge_sq + residual * residual)) ** 2
+        state[i, 3], state[i, 4] = offset, robust
+        _normal_row(x, y, z, t[0], t[1], t[2], K[0, 0], K[1, 1], nu, nv, row)
+        row[6 + MASK], row[6 + EDGE] = 0.0, -1.0
+        _accumulate(EDGE, H, g, squares, weights, row, lines[i, 2] * robust, residual)
+
+
+@njit(cache=True, nogil=True)
+def _combine(
+    H_each: Array, g_each: Array, squares: Array, weights: Array, biases: Array, correlation_px: float,
+    H: Array, g: Array,
+) -> None:  # fmt: skip
+    """Both residuals by their measured variances, and what is known of the biases: into H (8, 8), lower triangle, g."""
+    H[:], g[:] = 0.0, 0.0
+    for kind in range(2):
+        variance = squares[kind] / weights[kind] if weights[kind] > 0.0 else 0.0
+        information = 1.0 / (max(variance, VARIANCE_FLOOR_PX2) * correlation_px)
+        H += information * H_each[kind]
+        g += information * g_each[kind]
+    for kind in range(2):
+        information = BIAS_PX[kind] ** -2.0
+        H[6 + kind, 6 + kind] += information
+        g[6 + kind] -= information * biases[kind]
 
 
 @njit(cache=True, nogil=True)
@@ -282,82 +284,29 @@ def fit_contour(
         prior, and per point (N, 5): in the image (0/1), mask distance, its robust weight, edge offset, its weight
         (0 = no edge found); mask bias and edge bias in pixels.
     """
-    n = len(points)
-    row, mask_at = np.zeros(N_PARAMETERS), np.empty(3)
-    profile, levels = np.empty((64, 3)), np.empty(64)
-    state = np.zeros((n, 5))
-    height, width = image.shape[0], image.shape[1]
-    shape = (N_PARAMETERS, N_PARAMETERS)
-    H = np.zeros(shape)
-    mask_bias, edge_bias = 0.0, 0.0
-    turned = turned.copy()
-    correlation = CORRELATION_PX
-    for i in range(n):
-        correlation += CORRELATION_SHARE * lines[i, 2]
+    state, biases, turned = np.zeros((len(points), 5)), np.zeros(2), turned.copy()
+    H_each, g_each = np.empty((2, N_PARAMETERS, N_PARAMETERS)), np.empty((2, N_PARAMETERS))
+    squares, weights = np.empty(2), np.empty(2)
+    H, g = np.zeros((N_PARAMETERS, N_PARAMETERS)), np.empty(N_PARAMETERS)
+    correlation_px = CORRELATION_PX + CORRELATION_SHARE * lines[:, 2].sum()
+    scales_px = np.empty(2)
     for iteration in range(len(reaches_px)):
-        mask_sq, edge_sq = mask_scales_px[iteration] ** 2, edge_scales_px[iteration] ** 2
-        reach = reaches_px[iteration]
-        spacing = max(reach / 8.0, 0.5)
-        H_mask, g_mask = np.zeros(shape), np.zeros(N_PARAMETERS)
-        H_edge, g_edge = np.zeros(shape), np.zeros(N_PARAMETERS)
-        mask_sum, mask_weight, edge_sum, edge_weight = 0.0, 0.0, 0.0, 0.0
-        state[:] = 0.0
-        for i in range(n):
-            p = points[i]
-            x = R[0, 0] * p[0] + R[0, 1] * p[1] + R[0, 2] * p[2] + t[0]
-            y = R[1, 0] * p[0] + R[1, 1] * p[1] + R[1, 2] * p[2] + t[1]
-            z = R[2, 0] * p[0] + R[2, 1] * p[1] + R[2, 2] * p[2] + t[2]
-            if z <= 1e-6:
-                continue
-            u, v = (K[0, 0] * x + K[0, 1] * y) / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
-            if u < 1.0 or v < 1.0 or u > width - 2.0 or v > height - 2.0:
-                continue
-            state[i, 0] = 1.0
-            if mask_sq > 0.0:
-                _mask_distance(distance, u - origin[0], v - origin[1], mask_at)
-                residual = mask_at[0] - mask_bias
-                robust = (mask_sq / (mask_sq + residual * residual)) ** 2
-                weight = lines[i, 2] * robust
-                state[i, 1], state[i, 2] = mask_at[0], robust
-                _normal_row(x, y, z, t[0], t[1], t[2], K[0, 0], K[1, 1], mask_at[1], mask_at[2], row)
-                row[MASK_BIAS], row[EDGE_BIAS] = -1.0, 0.0
-                _accumulate(H_mask, g_mask, row, weight, residual)
-                mask_sum += weight * residual * residual
-                mask_weight += weight
-            inside, outside = min(reach, lines[i, 3]), min(reach, lines[i, 4])
-            if inside < MIN_REACH_PX or outside < MIN_REACH_PX:
-                continue
-            nu, nv = lines[i, 0], lines[i, 1]
-            offset, quality = edge_offset(image, u, v, nu, nv, inside, outside, spacing, profile, levels)
-            if quality <= 0.0:
-                continue
-            residual = -offset - edge_bias
-            robust = quality * (edge_sq / (edge_sq + residual * residual)) ** 2
-            weight = lines[i, 2] * robust
-            state[i, 3], state[i, 4] = offset, robust
-            _normal_row(x, y, z, t[0], t[1], t[2], K[0, 0], K[1, 1], nu, nv, row)
-            row[MASK_BIAS], row[EDGE_BIAS] = 0.0, -1.0
-            _accumulate(H_edge, g_edge, row, weight, residual)
-            edge_sum += weight * residual * residual
-            edge_weight += weight
-        mask_info = 1.0 / (_mean_square(mask_sum, mask_weight, VARIANCE_FLOOR_PX2) * correlation)
-        edge_info = 1.0 / (_mean_square(edge_sum, edge_weight, VARIANCE_FLOOR_PX2) * correlation)
-        H = mask_info * H_mask + edge_info * H_edge
-        g = mask_info * g_mask + edge_info * g_edge
-        H[MASK_BIAS, MASK_BIAS] += 1.0 / MASK_BIAS_PX**2
-        H[EDGE_BIAS, EDGE_BIAS] += 1.0 / EDGE_BIAS_PX**2
-        g[MASK_BIAS] -= mask_bias / MASK_BIAS_PX**2
-        g[EDGE_BIAS] -= edge_bias / EDGE_BIAS_PX**2
+        scales_px[MASK], scales_px[EDGE] = mask_scales_px[iteration], edge_scales_px[iteration]
+        H_each[:], g_each[:], squares[:], weights[:], state[:] = 0.0, 0.0, 0.0, 0.0, 0.0
+        _add_residuals(
+            points, lines, R, t, K, image, reaches_px[iteration], distance, origin, scales_px, biases,
+            H_each, g_each, squares, weights, state,
+        )  # fmt: skip
+        _combine(H_each, g_each, squares, weights, biases, correlation_px, H, g)
         A = H.copy()
+        A[3:6, 3:6] += rotation_info
         for i in range(3):
             for j in range(3):
-                A[i + 3, j + 3] += rotation_info[i, j]
                 g[i + 3] -= rotation_info[i, j] * turned[j]
-        ok, step = _damped_solve(A, g, dampings[iteration], radius_m)
+        ok, step = _damped_step(A, g, dampings[iteration], radius_m)
         if not ok:
             break
-        R, t = _update_pose(R, t, step)
+        R, t = product(rotation(step[3:6]), R), t + step[:3]
         turned += step[3:6]
-        mask_bias += step[MASK_BIAS]
-        edge_bias += step[EDGE_BIAS]
-    return R, t, H, state, mask_bias, edge_bias
+        biases += step[6:]
+    return R, t, H, state, biases[MASK], biases[EDGE]

@@ -22,7 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from hat_ros.slam.linear import (
+from hat_ros.linear import (
     cholesky_in_place,
     cholesky_solve,
     factor_system,

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from hat_ros.slam.linear import cholesky_in_place, cholesky_solve, product, rotation, turn_between
+from hat_ros.linear import cholesky_in_place, cholesky_solve, product, rotation, turn_between
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]

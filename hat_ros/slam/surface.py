@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from hat_ros import lie
 from hat_ros.config import FeatureSlamConfig
+from hat_ros.linear import robust_mean_rotation
 from hat_ros.render.embree import RayCaster
-from hat_ros.slam.linear import robust_mean_rotation
 from hat_ros.slam.window import Window
 from hat_ros.target import Target
 from hat_ros.types import PosePrior

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from hat_ros import lie
 from hat_ros.config import FeatureSlamConfig
+from hat_ros.linear import robust_mean_rotation, turn_between
 from hat_ros.slam.bundle import Problem, adjust_window, window_cost
-from hat_ros.slam.linear import robust_mean_rotation, turn_between
 from hat_ros.slam.reprojection import refine_pose
 
 Float = NDArray[np.float64]

@@ -5,7 +5,8 @@ from shape_scene import CAMERA, pose_errors, random_pose, spacecraft, sunlit_pic
 from hat_ros.hypotheses.lit_bank import build_lit, load_or_build_lit, sun_directions
 from hat_ros.hypotheses.matching import match_light
 from hat_ros.hypotheses.scoring import Scorer
-from hat_ros.refinement.view import MaskField, TargetViewer
+from hat_ros.refinement.mask_field import MaskField
+from hat_ros.refinement.view import TargetViewer
 
 SUN = np.array([-1.0, 0.4, -0.1])
 

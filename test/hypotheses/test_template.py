@@ -10,7 +10,8 @@ from hat_ros.hypotheses import template
 from hat_ros.hypotheses.matching import match_shape
 from hat_ros.hypotheses.stage import HypothesisStage
 from hat_ros.hypotheses.template import TemplateHypotheses
-from hat_ros.refinement.view import MaskField, TargetViewer, contour_lines
+from hat_ros.refinement.mask_field import MaskField
+from hat_ros.refinement.view import TargetViewer, contour_lines
 from hat_ros.render import create_renderer
 from hat_ros.types import Camera, Detection, Frame, PosePrior
 

@@ -2,7 +2,7 @@ import numpy as np
 
 from hat_ros import lie
 from hat_ros.refinement.covariance import OUTLINE_SIGMA_PX, USUAL_MISFIT_PX, outline_floor, outline_misfit_px
-from hat_ros.refinement.view import Overlap
+from hat_ros.refinement.mask_field import Overlap
 
 
 def test_an_outline_too_wide_all_around_is_a_depth_error():

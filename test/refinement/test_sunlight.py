@@ -3,8 +3,9 @@ import pytest
 from shape_scene import CAMERA, random_pose, spacecraft, sunlit_picture
 
 from hat_ros import lie
+from hat_ros.refinement.mask_field import MaskField
 from hat_ros.refinement.sunlight import LightField, SunMatcher, brightness
-from hat_ros.refinement.view import MaskField, TargetViewer, contour_lines
+from hat_ros.refinement.view import TargetViewer, contour_lines
 from hat_ros.render.embree import pixel_rays
 from hat_ros.types import Frame
 

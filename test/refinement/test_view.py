@@ -4,8 +4,9 @@ import pytest
 from shape_scene import CAMERA, random_pose, spacecraft
 
 from hat_ros import lie
+from hat_ros.refinement.mask_field import MaskField
 from hat_ros.refinement.refiner import PoseFitter
-from hat_ros.refinement.view import MaskField, TargetViewer
+from hat_ros.refinement.view import TargetViewer
 from hat_ros.render import create_renderer
 from hat_ros.render.outline import spread_grid
 from hat_ros.types import Camera

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from hat_ros import lie
+from hat_ros.linear import rotation, turn_between
 from hat_ros.slam.bundle import Problem, adjust_window, window_cost
-from hat_ros.slam.linear import rotation, turn_between
 from hat_ros.slam.reprojection import refine_pose
 
 FOCAL = 1000.0

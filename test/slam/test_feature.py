@@ -8,8 +8,8 @@ from speckled_clip import CAMERA, FRAME_NS, speckled_clip, turn_errors_deg
 
 from hat_ros import lie
 from hat_ros.config import FeatureSlamConfig, HatConfig, PriorConfig, SlamConfig
+from hat_ros.linear import turn_between
 from hat_ros.slam.feature import FeatureSlam, bulge, depth_beside
-from hat_ros.slam.linear import turn_between
 from hat_ros.types import Camera, Detection, Frame
 
 

@@ -3,7 +3,7 @@ import pytest
 
 from hat_ros import lie
 from hat_ros.config import FeatureSlamConfig
-from hat_ros.slam.linear import turn_between
+from hat_ros.linear import turn_between
 from hat_ros.slam.window import Window
 
 _FRAME_NS = 100_000_000

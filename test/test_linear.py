@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from hat_ros import lie
-from hat_ros.slam.linear import robust_mean_rotation
+from hat_ros.linear import cholesky_in_place, cholesky_solve, robust_mean_rotation, rotation
 
 _CUTOFF_RAD = 0.05
 
@@ -26,3 +26,23 @@ def test_the_mean_of_two_is_between_them_and_of_one_itself():
     mean = robust_mean_rotation(np.stack([step.T @ R, step @ R]), _CUTOFF_RAD)
     assert lie.angle_between(mean, R) < 1e-3
     np.testing.assert_allclose(robust_mean_rotation(R[None], _CUTOFF_RAD), R, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [1, 3, 6, 8])
+def test_cholesky_agrees_with_numpy(n):
+    rng = np.random.default_rng(n)
+    M = rng.normal(size=(n, n))
+    A, b = M @ M.T + 0.1 * np.eye(n), rng.normal(size=n)
+    L = np.tril(A)
+    assert cholesky_in_place(L)
+    np.testing.assert_allclose(cholesky_solve(L, b), np.linalg.solve(A, b), rtol=1e-8, atol=1e-10)
+
+
+def test_cholesky_refuses_an_indefinite_matrix():
+    assert not cholesky_in_place(np.diag([1.0, -1.0]))
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.3, np.pi - 1e-6])
+def test_rotation_agrees_with_the_core(angle):
+    r = angle * np.array([0.6, -0.48, 0.64])
+    np.testing.assert_allclose(rotation(r), lie.so3_exp(r), atol=1e-12)
