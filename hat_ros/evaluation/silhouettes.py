@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterable
 from tempfile import TemporaryFile
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from hat_ros.segmentation.masks import overlap
 from hat_ros.tracker import Step
 
-_FASTEST = 1  # compression; a silhouette takes a kilobyte
+Box = tuple[int, int, int, int]  # left, top, width, height
 
 
 class Silhouettes:
-    """What was detected in the frames of a run: compressed, in a file of its own, since memory must not grow."""
+    """What was detected in the frames of a run: a bit a pixel of its box, in a file, since memory must not grow."""
 
     def __init__(self) -> None:
         self._file = TemporaryFile()  # noqa: SIM115 - closed by close()
-        self._packed: dict[int, tuple[int, int] | None] = {}  # place and length by stamp
+        self._places: dict[int, tuple[int, Box] | None] = {}  # in the file and in the image, by stamp
 
     def close(self) -> None:
         """Forget everything."""
@@ -30,10 +30,11 @@ class Silhouettes:
         """Keep the mask of a frame that was looked at, or that there was none."""
         place = None
         if step.detection is not None:
-            packed = zlib.compress(np.packbits(step.detection.mask).tobytes(), _FASTEST)
-            place = self._file.tell(), len(packed)
-            self._file.write(packed)
-        self._packed[step.estimate.stamp_ns] = place
+            mask = step.detection.mask
+            box = cv2.boundingRect(mask.view(np.uint8))
+            place = self._file.tell(), box
+            self._file.write(np.packbits(mask[_within(box)]).tobytes())
+        self._places[step.estimate.stamp_ns] = place
 
     def overlaps(self, recorded: Iterable[tuple[int, NDArray[np.uint8] | None]]) -> dict[int, float]:
         """Stamp -> intersection over union, 0 for a target that was missed; frames that show no silhouette left out.
@@ -45,15 +46,23 @@ class Silhouettes:
         """
         out: dict[int, float] = {}
         for stamp_ns, given in recorded:
-            if given is None or stamp_ns in out or stamp_ns not in self._packed:
+            if given is None or stamp_ns in out or stamp_ns not in self._places:
                 continue
             silhouette = given == 255
             if silhouette.any():
-                place = self._packed[stamp_ns]
+                place = self._places[stamp_ns]
                 out[stamp_ns] = 0.0 if place is None else overlap(self._detected(*place, given.shape), silhouette)
         return out
 
-    def _detected(self, start: int, length: int, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    def _detected(self, start: int, box: Box, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+        _, _, width, height = box
         self._file.seek(start)
-        packed = np.frombuffer(zlib.decompress(self._file.read(length)), np.uint8)
-        return np.unpackbits(packed, count=shape[0] * shape[1]).reshape(shape).astype(bool)
+        packed = np.frombuffer(self._file.read(-(-width * height // 8)), np.uint8)
+        mask = np.zeros(shape, bool)
+        mask[_within(box)] = np.unpackbits(packed, count=width * height).reshape(height, width)
+        return mask
+
+
+def _within(box: Box) -> tuple[slice, slice]:
+    left, top, width, height = box
+    return np.s_[top : top + height, left : left + width]
