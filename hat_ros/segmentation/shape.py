@@ -33,10 +33,11 @@ class SilhouetteBank:
     Args:
         target: the CAD model.
         renderer: renders it.
-        subdivisions: of the icosahedron whose vertices are the view directions (2: 162 views).
+        subdivisions: of the icosahedron whose vertices are the view directions (3: 642 views; of 162, the
+            nearest to a mask of thin parts often lies too far off).
     """
 
-    def __init__(self, target: Target, renderer: Renderer, subdivisions: int = 2) -> None:
+    def __init__(self, target: Target, renderer: Renderer, subdivisions: int = 3) -> None:
         distance = _DISTANCE_RADII * target.bounding_radius_m
         focal = 0.47 * _SIDE_PX * np.sqrt(_DISTANCE_RADII**2 - 1.0)
         middle = (_SIDE_PX - 1) / 2
