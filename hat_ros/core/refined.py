@@ -179,16 +179,17 @@ class RefinedFusion:
         """Anchor and track stand in different basins: weigh the evidence so far.
 
         Against a track that others have spoken for, one anchor that barely won is not enough, however much the mask,
-        which both were compared with, prefers it.
+        which both were compared with, prefers it. Anchors that agree on what no image has ever supported say nothing.
         """
         self._n_disagreed += 1
         rival = self._best_refined(frame, detection, [anchor])
         lead = quality(rival) - quality(track)
         self._lead = lead if self._dissent.count == 1 else self._lead + lead
-        needed = min(self._n_agreed + 1, self._alignment_config.reset_anchors)
+        n_spoken = self._n_agreed if self._best_quality > 0.0 else 0
+        needed = min(n_spoken + 1, self._alignment_config.reset_anchors)
         margin = self._refinement.arbitration_margin
         clearly_better = self._lead >= margin and is_supported(rival, self._refinement)
-        clearly_better &= decided or self._n_agreed == 0
+        clearly_better &= decided or n_spoken == 0
         outnumbers = self._dissent.count >= needed and self._lead > -margin
         if not (clearly_better or outnumbers):
             return replace(self._outcome(track, predicted, predicted), gate_weight=self._fusion.gate_weight)

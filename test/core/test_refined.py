@@ -240,6 +240,21 @@ def test_a_rival_must_outnumber_the_anchors_behind_the_track(scene):
         assert (errors[switched_at:] < 1e-5).all()
 
 
+def test_anchors_that_no_image_has_supported_stand_for_no_track(scene):
+    """While the masks were wrong, what agreed was wrong alike: the first supported rival wins, however narrowly."""
+
+    def masked_well(index):
+        return {"true": (0.9, 0.9)} if index >= 40 else {}
+
+    stage = _stage(scene, masked_well, coast_limit_frames=60)
+    _run(stage, scene, range(24), lambda i, T: _flipped(T))
+    _run(stage, scene, range(24, 40), lambda i, T: None)
+    frames = range(40, 56)
+    estimates = _run(stage, scene, frames, lead=1.0)
+    np.testing.assert_allclose(_errors(estimates, scene, frames), 0, atol=1e-5)
+    assert estimates[0].n_resets == 1
+
+
 @pytest.mark.parametrize(("lead", "left_after"), [(1.0, 1), (6.0, 4)])
 def test_anchors_that_barely_won_give_a_track_no_seniority(scene, lead, left_after):
     """The decoder remembers how close it was: where it changes its mind, as many more anchors would only be late."""
