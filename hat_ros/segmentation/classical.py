@@ -36,9 +36,9 @@ class ClassicalSegmenter:
     def __init__(self, config: HatConfig, target: Target) -> None:
         self._config = config.segmentation.classical
         self._renderer = EmbreeRenderer(target)
-        bank = SilhouetteBank(target, self._renderer)
-        self._lit = LitBody(self._config, bank)
-        self._textured = TexturedBackground(self._config, bank)
+        # What is lit is seldom a whole silhouette, and is compared in every frame: there the coarse bank does.
+        self._lit = LitBody(self._config, SilhouetteBank(target, self._renderer, subdivisions=2))
+        self._textured = TexturedBackground(self._config, SilhouetteBank(target, self._renderer))
         self.reset()
 
     def reset(self) -> None:

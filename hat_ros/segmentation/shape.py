@@ -33,8 +33,8 @@ class SilhouetteBank:
     Args:
         target: the CAD model.
         renderer: renders it.
-        subdivisions: of the icosahedron whose vertices are the view directions (3: 642 views; of 162, the
-            nearest to a mask of thin parts often lies too far off).
+        subdivisions: of the icosahedron whose vertices are the view directions (3: 642 views, 2: 162, of which the
+            nearest often lies too far off a mask of thin parts).
     """
 
     def __init__(self, target: Target, renderer: Renderer, subdivisions: int = 3) -> None:
