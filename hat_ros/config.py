@@ -117,7 +117,7 @@ class HypothesesConfig:
 class FeatureSlamConfig:
     """Training-free target-relative motion."""
 
-    max_points: int = option(150, "point tracks kept alive", low=16, high=2000)
+    max_points: int = option(200, "point tracks kept alive", low=16, high=2000)
     spacing_px: float = option(4.0, "least distance between a new point and any other, px", low=1)
     window_frames: int = option(10, "frames adjusted together, spread over the span", low=8, high=64)
     window_span_frames: int = option(60, "age at which a frame leaves the window", low=8, high=1000)
