@@ -15,9 +15,9 @@ class KeyframeSchedule:
     opportunity stays open for the next frame that has one.
 
     Our extension: while a track is settled, an absolute estimate has little to add, and the gap is
-    ``settled_factor`` times as long; and a first attempt in vain is repeated as many times sooner, since a wrong start
-    stands until then: one that decided nothing, or on a detection that soon turned out to be of something else. The
-    paper's spacing is a factor of 1.
+    ``settled_factor`` times as long; and an attempt in vain is repeated as many times sooner, since a wrong start
+    stands until then: a first one that decided nothing, or any on a detection that soon turned out to be of something
+    else. The paper's spacing is a factor of 1.
     """
 
     def __init__(self, config: KeyframeConfig) -> None:
@@ -32,14 +32,14 @@ class KeyframeSchedule:
         Args:
             has_detection: the target has been found in the image.
             healthy: the fused state of the past, as the prior of this frame tells it, is TRACKING.
-            in_vain: the target is no longer found where the last attempt was made.
+            in_vain: what is detected is no longer what the last attempt was made on.
         """
         self._frames_since_attempt += 1
         if not healthy:
             self._healthy_attempts = 0
         settled = self._healthy_attempts >= SETTLING_ATTEMPTS
         gap_frames = self._settled_gap_frames if settled else self._gap_frames
-        if self._n_attempts == 1 and (in_vain or not self._decided):
+        if in_vain or (self._n_attempts == 1 and not self._decided):
             gap_frames = self._early_gap_frames
         if not has_detection or self._frames_since_attempt < gap_frames:
             return False

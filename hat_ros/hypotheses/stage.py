@@ -11,8 +11,10 @@ from hat_ros.stages import create_backend
 from hat_ros.target import Target
 from hat_ros.types import Candidates, Detection, Float, Frame, PosePrior
 
-# Intersection over union below which two boxes do not hold the same thing.
+# Intersection over union below which two boxes do not hold the same thing; nor do two masks where one has this share of
+# the other's area.
 _SAME_BOX_OVERLAP = 0.5
+_SAME_AREA_SHARE = 0.8
 
 
 class HypothesisStage:
@@ -29,7 +31,7 @@ class HypothesisStage:
         self._schedule = KeyframeSchedule(config.keyframes)
         self._apart_deg, self._min_lead = config.fusion.gate_angle_deg, config.refinement.min_margin
         self._backend = create_backend("hypotheses", config, target)
-        self._tried_xyxy: Float | None = None
+        self._tried: Detection | None = None
 
     def update(self, frame: Frame, detection: Detection | None, prior: PosePrior | None) -> Candidates:
         """Candidates of one frame, best first; zero rows between keyframes and without a detection.
@@ -38,10 +40,10 @@ class HypothesisStage:
             CandidateError: the backend returned a score or pose that is not finite and ``hypotheses.guard`` is off.
         """
         healthy = prior is not None and prior.healthy
-        in_vain = not healthy and detection is not None and self._is_elsewhere(detection)
+        in_vain = not healthy and detection is not None and self._is_another(detection)
         if not self._schedule.update(detection is not None, healthy, in_vain) or detection is None:
             return Candidates.none()
-        self._tried_xyxy = detection.box_xyxy
+        self._tried = detection
         candidates = self._backend.generate(frame, detection, prior)
         if len(candidates) > self._max_candidates:
             keep = slice(self._max_candidates)
@@ -54,12 +56,17 @@ class HypothesisStage:
         """Forget earlier frames; the next frame with a detection is a keyframe."""
         self._schedule.reset()
         self._backend.reset()
-        self._tried_xyxy = None
+        self._tried = None
 
-    def _is_elsewhere(self, detection: Detection) -> bool:
-        """Whether hardly the same box was tried last: a mask of a part, or of something else."""
-        tried = self._tried_xyxy
-        return tried is not None and box_overlap(tried, detection.box_xyxy) < _SAME_BOX_OVERLAP
+    def _is_another(self, detection: Detection) -> bool:
+        """Whether the last attempt was made on something else, or on a mask that lacked a part or held too much."""
+        tried = self._tried
+        if tried is None:
+            return False
+        smaller, larger = sorted((tried.area_px, detection.area_px))
+        return (
+            smaller < _SAME_AREA_SHARE * larger or box_overlap(tried.box_xyxy, detection.box_xyxy) < _SAME_BOX_OVERLAP
+        )
 
 
 def box_overlap(a: Float, b: Float) -> float:

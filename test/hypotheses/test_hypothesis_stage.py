@@ -35,11 +35,22 @@ def _asked(monkeypatch, detections):
     return np.flatnonzero(asked).tolist()
 
 
-def test_a_start_on_a_part_of_the_target_is_tried_again_once_all_of_it_is_found(monkeypatch):
+def test_what_was_tried_on_a_part_of_the_target_is_tried_again_once_all_of_it_is_found(monkeypatch):
     part, whole = _detection(8, 20), _detection(8, 40)
     assert _asked(monkeypatch, [part] + 11 * [whole]) == [0, 2, 8]
     assert _asked(monkeypatch, 12 * [whole]) == [0, 6]
-    assert _asked(monkeypatch, 7 * [whole] + 7 * [part]) == [0, 6, 12]  # only the start is so urgent
+    assert _asked(monkeypatch, 7 * [whole] + 7 * [part]) == [0, 6, 8]
+
+
+def test_a_part_missing_inside_the_box_counts(monkeypatch):
+    whole, holed = _detection(8, 40), _detection(8, 40)
+    holed.mask[14:34, 14:34] = False
+    assert _asked(monkeypatch, [holed] + 7 * [whole]) == [0, 2]
+
+
+def test_a_target_that_only_turns_a_little_is_not_tried_again(monkeypatch):
+    growing = [_detection(8, 30 + i) for i in range(6)]
+    assert _asked(monkeypatch, growing) == [0]
 
 
 @pytest.mark.parametrize(
