@@ -32,7 +32,7 @@ class KeyframeSchedule:
         Args:
             has_detection: the target has been found in the image.
             healthy: the fused state of the past, as the prior of this frame tells it, is TRACKING.
-            in_vain: what is detected is no longer what the last attempt was made on.
+            in_vain: what the last attempt was made on turned out to be a part of the target, or something else.
         """
         self._frames_since_attempt += 1
         if not healthy:

@@ -11,8 +11,8 @@ from hat_ros.stages import create_backend
 from hat_ros.target import Target
 from hat_ros.types import Candidates, Detection, Float, Frame, PosePrior
 
-# Intersection over union below which two boxes do not hold the same thing; nor do two masks where one has this share of
-# the other's area.
+# Between successive detections of one thing little changes: boxes overlap by this, intersection over union, and
+# neither mask has less than this share of the other's area.
 _SAME_BOX_OVERLAP = 0.5
 _SAME_AREA_SHARE = 0.8
 
@@ -31,7 +31,8 @@ class HypothesisStage:
         self._schedule = KeyframeSchedule(config.keyframes)
         self._apart_deg, self._min_lead = config.fusion.gate_angle_deg, config.refinement.min_margin
         self._backend = create_backend("hypotheses", config, target)
-        self._tried: Detection | None = None
+        self._newest: Detection | None = None
+        self._changed = False
 
     def update(self, frame: Frame, detection: Detection | None, prior: PosePrior | None) -> Candidates:
         """Candidates of one frame, best first; zero rows between keyframes and without a detection.
@@ -40,10 +41,11 @@ class HypothesisStage:
             CandidateError: the backend returned a score or pose that is not finite and ``hypotheses.guard`` is off.
         """
         healthy = prior is not None and prior.healthy
-        in_vain = not healthy and detection is not None and self._is_another(detection)
+        self._observe(detection)
+        in_vain = self._changed and not healthy
         if not self._schedule.update(detection is not None, healthy, in_vain) or detection is None:
             return Candidates.none()
-        self._tried = detection
+        self._changed = False
         candidates = self._backend.generate(frame, detection, prior)
         if len(candidates) > self._max_candidates:
             keep = slice(self._max_candidates)
@@ -56,17 +58,16 @@ class HypothesisStage:
         """Forget earlier frames; the next frame with a detection is a keyframe."""
         self._schedule.reset()
         self._backend.reset()
-        self._tried = None
+        self._newest, self._changed = None, False
 
-    def _is_another(self, detection: Detection) -> bool:
-        """Whether the last attempt was made on something else, or on a mask that lacked a part or held too much."""
-        tried = self._tried
-        if tried is None:
-            return False
-        smaller, larger = sorted((tried.area_px, detection.area_px))
-        return (
-            smaller < _SAME_AREA_SHARE * larger or box_overlap(tried.box_xyxy, detection.box_xyxy) < _SAME_BOX_OVERLAP
-        )
+    def _observe(self, detection: Detection | None) -> None:
+        """Note when a detection is of something else than the one before, lacks a part of it or holds more."""
+        before, self._newest = self._newest, detection or self._newest
+        if detection is None or before is None:
+            return
+        smaller, larger = sorted((before.area_px, detection.area_px))
+        same_place = box_overlap(before.box_xyxy, detection.box_xyxy) >= _SAME_BOX_OVERLAP
+        self._changed |= smaller < _SAME_AREA_SHARE * larger or not same_place
 
 
 def box_overlap(a: Float, b: Float) -> float:
