@@ -15,8 +15,7 @@ Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 Image = NDArray[np.uint8]
 
-# A turning surface distorts larger windows; smaller ones tell less of a faint texture.
-_WINDOW_PX = 13
+_WINDOW_PX = 17
 _LEVELS = 3
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.03)
 _MIN_EIGENVALUE = 1e-4
