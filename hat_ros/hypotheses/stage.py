@@ -42,7 +42,7 @@ class HypothesisStage:
         """
         healthy = prior is not None and prior.healthy
         self._observe(detection)
-        in_vain = self._changed and not healthy
+        in_vain = self._changed and (prior is None or not prior.supported)
         if not self._schedule.update(detection is not None, healthy, in_vain) or detection is None:
             return Candidates.none()
         self._changed = False
