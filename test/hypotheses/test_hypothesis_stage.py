@@ -6,7 +6,7 @@ import pytest
 from hat_ros.config import HatConfig, KeyframeConfig
 from hat_ros.hypotheses import stage as hypothesis_stage
 from hat_ros.hypotheses.stage import HypothesisStage, box_overlap
-from hat_ros.types import Camera, Candidates, Detection, Frame
+from hat_ros.types import Camera, Candidates, Detection, Frame, PosePrior
 
 CAMERA = Camera(np.array([[200.0, 0, 32], [0, 200.0, 32], [0, 0, 1]]), 64, 64)
 DECIDED = Candidates(np.array([[0, 0, 5, 0, 0, 0, 1.0]]), np.zeros(1), np.array([8.0, 8, 40, 40]))
@@ -26,12 +26,12 @@ def _detection(left, right):
     return Detection(mask)
 
 
-def _asked(monkeypatch, detections):
+def _asked(monkeypatch, detections, prior=None):
     monkeypatch.setattr(hypothesis_stage, "create_backend", lambda *_: _Backend())
     stage = HypothesisStage(HatConfig(keyframes=KeyframeConfig(gap_frames=6, settled_factor=3)), None)
     image = np.zeros((64, 64, 3), np.uint8)
     frames = [Frame(i + 1, image, CAMERA) for i in range(len(detections))]
-    asked = [len(stage.update(f, d, None)) > 0 for f, d in zip(frames, detections, strict=True)]
+    asked = [len(stage.update(f, d, prior)) > 0 for f, d in zip(frames, detections, strict=True)]
     return np.flatnonzero(asked).tolist()
 
 
@@ -46,6 +46,13 @@ def test_a_part_missing_inside_the_box_counts(monkeypatch):
     whole, holed = _detection(8, 40), _detection(8, 40)
     holed.mask[14:34, 14:34] = False
     assert _asked(monkeypatch, [holed] + 7 * [whole]) == [0, 2]
+
+
+@pytest.mark.parametrize(("supported", "asked"), [(False, [0, 2]), (True, [0])])
+def test_a_changed_mask_is_no_matter_while_an_image_supports_the_track(monkeypatch, supported, asked):
+    row = np.array([0, 0, 5, 0, 0, 0, 1.0])
+    prior = PosePrior(1, row, row, healthy=False, supported=supported)
+    assert _asked(monkeypatch, [_detection(8, 20)] + 5 * [_detection(8, 40)], prior) == asked
 
 
 def test_a_target_that_only_turns_a_little_is_not_tried_again(monkeypatch):
