@@ -219,7 +219,7 @@ class RefinedFusion:
         else:
             position = (output if at_rate is None else at_rate)[:3, 3]
         moved = lie.transform(step[:3, :3] @ output[:3, :3], position)
-        return [moved] if at_rate is None else [moved, at_rate]
+        return [moved] if at_rate is None or self._same(moved, at_rate) else [moved, at_rate]
 
     def _at_constant_rate(self, stamp_ns: int) -> Float | None:
         """The measured outputs continued; None with fewer than two."""
@@ -241,14 +241,17 @@ class RefinedFusion:
         Starts close to a supported pose are not tried: they would end there.
         """
         for start in starts:
-            if is_supported(best, self._refinement):
-                apart_rad = lie.angle_between(start[:3, :3], best.T_cam_target[:3, :3])
-                if apart_rad <= np.radians(self._refinement.same_pose_deg):
-                    continue
+            if is_supported(best, self._refinement) and self._same(start, best.T_cam_target):
+                continue
             refined = self._refiner.refine(frame, detection, start)
             if quality(refined) > quality(best) + (lead if is_supported(best, self._refinement) else 0.0):
                 best = refined
         return best
+
+    def _same(self, T_a: Float, T_b: Float) -> bool:
+        """Whether refinements that start at these poses would end at the same."""
+        apart_rad = lie.angle_between(T_a[:3, :3], T_b[:3, :3])
+        return bool(apart_rad <= np.radians(self._refinement.same_pose_deg))
 
     def _jumps(self, fused: Fused) -> bool:
         """The measurement left the pose that the past predicted: earlier poses tell no rate."""

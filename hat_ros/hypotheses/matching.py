@@ -217,35 +217,34 @@ def _peaks(score: NDArray[np.float32]) -> NDArray[np.intp]:
 
 def _correlate(bank: ViewBank, grids: NDArray[np.float32]) -> NDArray[np.float32]:
     """Inner products of grids (P, angles, rings) with every view turned by every angle: (P, V, angles)."""
-    spectrum = np.fft.rfft(grids, axis=1).astype(np.complex64).transpose(1, 2, 0)  # (F, rings, P)
+    spectrum = np.fft.rfft(grids, axis=1).astype(np.complex64).transpose(1, 0, 2)  # (F, P, rings)
     real, imag = np.ascontiguousarray(spectrum.real), np.ascontiguousarray(spectrum.imag)
     product = _cross_spectrum(np.asarray(bank.spectrum), real, imag)
     return np.fft.irfft(product, n=bank.n_angles, axis=2).astype(np.float32)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _cross_spectrum(
     views: NDArray[np.complex64], real: NDArray[np.float32], imag: NDArray[np.float32]
 ) -> NDArray[np.complex64]:
-    """Sum over rings of ``conj(views) * query``: (F, V, rings), twice (F, rings, P) -> (P, V, F).
+    """Sum over rings of ``conj(views) * query``: (F, V, rings), twice (F, P, rings) -> (P, V, F).
 
-    Compiled rather than left to BLAS: many small products, whose threads cost more than they save.
+    Compiled rather than left to BLAS: many small products, whose threads cost more than they save. The sums may be
+    taken in any order, or they could not be vectorised, which is ten times slower.
     """
     n_frequencies, n_views, n_rings = views.shape
-    n_queries = real.shape[2]
+    n_queries = real.shape[1]
     out = np.empty((n_queries, n_views, n_frequencies), np.complex64)
-    sum_real, sum_imag = np.empty(n_queries, np.float32), np.empty(n_queries, np.float32)
     for f in range(n_frequencies):
-        for v in range(n_views):
-            sum_real[:] = 0.0
-            sum_imag[:] = 0.0
-            for r in range(n_rings):
-                a, b = views[f, v, r].real, views[f, v, r].imag
-                for p in range(n_queries):
-                    sum_real[p] += a * real[f, r, p] + b * imag[f, r, p]
-                    sum_imag[p] += a * imag[f, r, p] - b * real[f, r, p]
-            for p in range(n_queries):
-                out[p, v, f] = complex(sum_real[p], sum_imag[p])
+        for p in range(n_queries):
+            x, y = real[f, p], imag[f, p]
+            for v in range(n_views):
+                sum_real, sum_imag = np.float32(0.0), np.float32(0.0)
+                for r in range(n_rings):
+                    a, b = views[f, v, r].real, views[f, v, r].imag
+                    sum_real += a * x[r] + b * y[r]
+                    sum_imag += a * y[r] - b * x[r]
+                out[p, v, f] = complex(sum_real, sum_imag)
     return out
 
 

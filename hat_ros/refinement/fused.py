@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -34,28 +35,45 @@ _ENOUGH_SUPPORT = 0.7
 _SMALL_MOVE_PX = 2.0
 
 
+class _Image:
+    """One image and its mask, ready for every pose that is refined on it.
+
+    Attributes:
+        frame, detection: what was given.
+        luma: (H, W) the image in grey.
+        field: the mask, None without a silhouette.
+    """
+
+    def __init__(self, frame: Frame, detection: Detection | None) -> None:
+        self.frame, self.detection = frame, detection
+        self.luma = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+        self.field = MaskField(detection.mask) if detection is not None and detection.silhouette else None
+
+    @cached_property
+    def light(self) -> LightField:
+        """What shaded models are compared with; there must be a mask."""
+        return LightField(self.frame.rgb, self.field.mask)
+
+    def areas(self, view: View | None) -> Overlap | None:
+        """Agreement of mask and view, None without one of them."""
+        return None if self.field is None or view is None else self.field.compare(view, self.luma)
+
+
 @dataclass(frozen=True, eq=False)
 class _Task:
     """A pose to refine on an image.
 
     Attributes:
-        frame, luma: the image, and (H, W) the same in grey.
-        field: the mask, None without a silhouette.
+        image: which.
         prior: what is known of the rotation.
         start: (4, 4) pose to start from.
         view: what the target looks like there, None when it is out of view.
     """
 
-    frame: Frame
-    luma: NDArray[np.uint8]
-    field: MaskField | None
+    image: _Image
     prior: RotationPrior
     start: NDArray[np.float64]
     view: View | None
-
-    def areas(self, view: View | None) -> Overlap | None:
-        """Agreement of mask and view, None without one of them."""
-        return None if self.field is None or view is None else self.field.compare(view, self.luma)
 
 
 class FusedPoseRefiner:
@@ -73,6 +91,7 @@ class FusedPoseRefiner:
         self._viewer = TargetViewer(target)
         self._sun = SunMatcher(self._viewer)
         self._fitter = PoseFitter(self._viewer, config.render_px, config.max_points)
+        self._image: _Image | None = None  # the newest: several poses are refined on each where the track is in doubt
 
     def refine(
         self,
@@ -93,8 +112,8 @@ class FusedPoseRefiner:
             The refined pose with its uncertainty, or None when the target is out of view, nothing in the image can be
             measured, or the refinement would leave the basin.
         """
-        task = self._task(frame, detection, T_cam_target, prior)
-        at_start = task.areas(task.view)
+        task = self._task(self._look(frame, detection), T_cam_target, prior)
+        at_start = task.image.areas(task.view)
         in_shadow = at_start is not None and _lies_in_shadow(at_start)
         if in_shadow:
             sunlit = self._sunlit(task)
@@ -103,7 +122,7 @@ class FusedPoseRefiner:
         fit = self._fine(task) or self._fit_all(task, task.view)
         if fit is None:
             return None
-        areas = task.areas(fit.shown)
+        areas = task.image.areas(fit.shown)
         refined = self._judged(task, fit, areas)
         if in_shadow or refined is None or areas is None or not _looks_small(areas):
             return refined
@@ -112,36 +131,36 @@ class FusedPoseRefiner:
         return sunlit if sunlit is not None and sunlit.quality > refined.quality else refined
 
     def reset(self) -> None:
-        """Nothing to forget: every frame stands for itself."""
+        """Let go of the last image; nothing else is kept, every frame stands for itself."""
+        self._image = None
 
-    def _task(
-        self,
-        frame: Frame,
-        detection: Detection | None,
-        T_cam_target: NDArray[np.float64],
-        prior: RotationPrior | None,
-    ) -> _Task:
+    def _look(self, frame: Frame, detection: Detection | None) -> _Image:
+        """Prepare an image, unless it is the one before."""
+        if self._image is None or self._image.frame is not frame or self._image.detection is not detection:
+            self._image = _Image(frame, detection)
+        return self._image
+
+    def _task(self, image: _Image, T_cam_target: NDArray[np.float64], prior: RotationPrior | None) -> _Task:
         """The start is centred on the mask if need be."""
-        field = MaskField(detection.mask) if detection is not None and detection.silhouette else None
-        luma = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+        camera = image.frame.camera
         prior = prior or RotationPrior(T_cam_target[:3, :3], self._start_information)
-        start, view = T_cam_target, self._viewer.view(T_cam_target, frame.camera, self._config.render_px)
-        if view is not None and field is not None:
-            start = self._fitter.centred(T_cam_target, frame.camera, field, luma, view)
+        start, view = T_cam_target, self._viewer.view(T_cam_target, camera, self._config.render_px)
+        if view is not None and image.field is not None:
+            start = self._fitter.centred(T_cam_target, camera, image.field, image.luma, view)
             if start is not T_cam_target:
-                view = self._viewer.view(start, frame.camera, self._config.render_px)
-        return _Task(frame, luma, field, prior, start, view)
+                view = self._viewer.view(start, camera, self._config.render_px)
+        return _Task(image, prior, start, view)
 
     def _sunlit(self, task: _Task) -> Refined | None:
         """Refined by the contour of what the sun shines on; None where that is hardly anything, or no sun is found."""
-        sunlight = self._sun.match(task.view, LightField(task.frame.rgb, task.field.mask))
+        sunlight = self._sun.match(task.view, task.image.light)
         if sunlight is None:
             return None
         lit = self._viewer.in_sunlight(task.view, sunlight.to_sun_cam)
         fit = self._fit_all(task, lit, sunlight.to_sun_cam)
         if fit is None:
             return None
-        refined = self._judged(task, fit, task.areas(fit.shown))
+        refined = self._judged(task, fit, task.image.areas(fit.shown))
         return refined if refined is not None and refined.misfit_px <= _STUB_MISFIT_PX else None
 
     def _judged(self, task: _Task, fit: Fit, areas: Overlap | None) -> Refined | None:
@@ -151,7 +170,7 @@ class FusedPoseRefiner:
         covariance = pose_covariance(fit, self._target.bounding_radius_m)
         if covariance is None:
             return None
-        focal_px = float(task.frame.camera.K[0, 0])
+        focal_px = float(task.image.frame.camera.K[0, 0])
         covariance = covariance + outline_floor(fit.T_cam_target, focal_px, self._target.bounding_radius_m)
         overlap, visible_overlap, misfit_px = float("nan"), float("nan"), 0.0
         if areas is not None:
@@ -163,10 +182,10 @@ class FusedPoseRefiner:
 
     def _fine(self, task: _Task) -> Fit | None:
         """The finest round alone; None unless that explains the image and hardly moves the start."""
-        frame, view = task.frame, task.view
-        if task.field is None or view is None:
+        frame, field, view = task.image.frame, task.image.field, task.view
+        if field is None or view is None:
             return None
-        fit = self._fitter.fit(task.start, frame.camera, frame.rgb, task.field, WITH_MASK[-1:], task.prior, view=view)
+        fit = self._fitter.fit(task.start, frame.camera, frame.rgb, field, WITH_MASK[-1:], task.prior, view=view)
         if fit.support < _ENOUGH_SUPPORT:
             return None
         # The view is the start's.
@@ -174,7 +193,7 @@ class FusedPoseRefiner:
 
     def _fit_all(self, task: _Task, view: View | None, to_sun_cam: NDArray[np.float64] | None = None) -> Fit | None:
         """All rounds, from the widest to the finest, with a view of the start, all or its sunlit part."""
-        frame, field, rounds = task.frame, task.field, WITHOUT_MASK
+        frame, field, rounds = task.image.frame, task.image.field, WITHOUT_MASK
         if field is not None:
             factor = float(np.clip(field.size_px / _USUAL_SIZE_PX, *_SCALE_LIMITS))
             rounds = (WITH_MASK[0].scaled(factor), *WITH_MASK[1:])
