@@ -3,7 +3,8 @@
 Before a black sky a mask holds only what is lit, so its shape may be that of no view at all. The brightness itself does
 not suffer: what is dark weighs nothing, in the image as in the prediction. Each view under each sun is laid on the same
 polar grid as the silhouettes of :mod:`hat_ros.hypotheses.bank`, about the centroid of its light, so that the same
-product of spectra correlates it with an image at every in-plane angle.
+product of spectra correlates it with an image at every in-plane angle. Of what is compared the root is taken: gloss,
+which the model does not know, would outweigh everything else.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from hat_ros.refinement.view import Surfels, TargetViewer
 from hat_ros.render.embree import pixel_rays
 from hat_ros.types import Camera
 
-_FORMAT = 1
+_FORMAT = 2
 _N_VIEWS = 162
 # Angles between the sun and the camera, seen from the target, each with that many suns around the line of sight.
 # Nearer to the camera hardly anything is in shadow, further away hardly anything is lit.
@@ -70,6 +71,11 @@ def sun_directions() -> NDArray[np.float64]:
     return np.array(out)
 
 
+def subdued(light: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Brightness as it is compared, of any scale."""
+    return np.sqrt(light)
+
+
 def build_lit(viewer: TargetViewer, n_angles: int) -> LitBank:
     """Render every view under every sun and describe its brightness."""
     distance = _DISTANCE_RADII * viewer.target.bounding_radius_m
@@ -83,7 +89,7 @@ def build_lit(viewer: TargetViewer, n_angles: int) -> LitBank:
                 continue
             R_all.append(R)
             sun_all.append(sun)
-            described.append(_describe(image, view.camera, n_angles))
+            described.append(_describe(subdued(image), view.camera, n_angles))
             contours.append(view.contour(image))
     n = len(R_all)
     contour, weight = np.zeros((n, CONTOUR_POINTS, 3)), np.zeros((n, CONTOUR_POINTS))

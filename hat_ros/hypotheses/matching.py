@@ -124,7 +124,7 @@ def match_light(
 
     Args:
         bank: the target's views, each spectrum of unit norm.
-        light: (H, W) float32, black but for the target, not all black.
+        light: (H, W) float32, black but for the target, not all black; subdued as the bank is.
         camera, n_best, separation_deg, center_m: as for :func:`match_shape`.
     """
     placement = Placement(*image_moments(light))
