@@ -10,9 +10,9 @@ At keyframes the selected anchor competes with the track:
 * Within D of the track it is one basin, and the anchor one more start for the refinement: the best result wins.
 * Beyond D it is a rival. Successive rivals that follow from each other (the paper's coherence) add up, and so does
   their lead in image evidence over the track. A rival takes over once it is supported, leads by ``arbitration_margin``
-  and is the decoder's clear choice, if anchors stood for the track; or once as many coherent rivals stand against the
-  track as anchors clearly stood for it (``reset_anchors`` at most, as in the paper), unless the image speaks against
-  them by that margin.
+  and is the decoder's clear choice, if anchors stood for the track; or once more coherent rivals stand against the
+  track than anchors clearly stood for it, the first one included (``reset_anchors`` at most, as in the paper), unless
+  the image speaks against them by that margin.
 
 With no refinement supported, the output is what the paper's fusion makes of prediction and anchor, and it coasts. A
 supported output is called TRACKING only if it is beyond doubt as well (``core.confidence``): the image is certain, or a
@@ -75,7 +75,8 @@ class RefinedFusion:
         self._attitude.forget()
         self._held: Refined | None = None
         self._best_quality = 0.0
-        self._n_agreed = 0
+        self._founded = False  # by an anchor that was the decoder's clear choice
+        self._n_agreed = 0  # such anchors since
         self._n_disagreed = 0
         self._forget_rivals()
 
@@ -120,7 +121,7 @@ class RefinedFusion:
         decided: bool,
     ) -> Fused:
         if not predictions:
-            return self._start(frame, detection, anchor)
+            return self._start(frame, detection, anchor, decided)
         predicted = predictions[0]
         self._held = self._refiner.refine(frame, detection, predicted, self._known_of(predicted))
         track = self._best_refined(frame, detection, predictions[1:], self._held, self._refinement.switch_margin)
@@ -141,10 +142,11 @@ class RefinedFusion:
         output, _ = self._output
         return RotationPrior(predicted[:3, :3], self._attitude.predict(predicted[:3, :3] @ output[:3, :3].T))
 
-    def _start(self, frame: Frame, detection: Detection | None, anchor: Float | None) -> Fused:
+    def _start(self, frame: Frame, detection: Detection | None, anchor: Float | None, decided: bool) -> Fused:
         """Without a track the anchor starts one; unless the image supports it, it only coasts."""
         if anchor is None:
             return Fused(None)
+        self._founded = decided
         refined = self._best_refined(frame, detection, [anchor])
         return replace(self._outcome(refined, anchor, None), gate_weight=1.0)
 
@@ -185,7 +187,7 @@ class RefinedFusion:
         rival = self._best_refined(frame, detection, [anchor])
         lead = quality(rival) - quality(track)
         self._lead = lead if self._dissent.count == 1 else self._lead + lead
-        n_spoken = self._n_agreed if self._best_quality > 0.0 else 0
+        n_spoken = self._n_agreed + self._founded if self._best_quality > 0.0 else 0
         needed = min(n_spoken + 1, self._alignment_config.reset_anchors)
         margin = self._refinement.arbitration_margin
         clearly_better = self._lead >= margin and is_supported(rival, self._refinement)
@@ -194,6 +196,7 @@ class RefinedFusion:
         if not (clearly_better or outnumbers):
             return replace(self._outcome(track, predicted, predicted), gate_weight=self._fusion.gate_weight)
         self._start_track()
+        self._founded = decided
         return replace(self._outcome(rival, anchor, None), gate_weight=1.0, reset=True)
 
     def _forget_rivals(self) -> None:

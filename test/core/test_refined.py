@@ -126,9 +126,9 @@ def test_a_locked_wrong_basin_is_left_when_the_image_prefers_the_anchor(scene):
     assert (errors[56:] < 1e-5).all()
 
 
-@pytest.mark.parametrize(("lead", "left"), [(1.0, 64), (6.0, 56)])
+@pytest.mark.parametrize(("lead", "left"), [(1.0, 72), (6.0, 56)])
 def test_a_track_that_anchors_stood_for_is_not_left_for_one_that_barely_won(scene, lead, left):
-    """Whatever the image prefers; two such anchors outnumber the one that stood for the track."""
+    """Whatever the image prefers; three such anchors outnumber the two that stood for the track."""
     stage = _stage(scene)
     _run(stage, scene, range(16), lambda i, T: _flipped(T))
     _run(stage, scene, range(16, 56), lambda i, T: None)
@@ -227,7 +227,7 @@ def test_a_track_that_anchors_contradict_is_in_doubt_until_two_agree(scene):
 
 
 def test_a_rival_must_outnumber_the_anchors_behind_the_track(scene):
-    """Equal evidence: as many coherent rivals as anchors stood for the track, four at most."""
+    """Equal evidence: more coherent rivals than anchors stood for the track, its first included; four at most."""
 
     def equal(index):
         return {"true": (0.9, 0.9), "flipped": (0.9, 0.9)}
@@ -235,7 +235,7 @@ def test_a_rival_must_outnumber_the_anchors_behind_the_track(scene):
     for n_for in (1, 2, 3, 6):
         estimates = _run(_stage(scene, equal), scene, range(120), lambda i, T, n=n_for: _flipped(T) if i < 8 * n else T)
         errors = _errors(estimates, scene, range(120))
-        switched_at = 8 * n_for + 8 * (min(n_for, 4) - 1)
+        switched_at = 8 * n_for + 8 * (min(n_for + 1, 4) - 1)
         assert (errors[:switched_at] > 170).all()
         assert (errors[switched_at:] < 1e-5).all()
 
