@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from hat_ros import lie
 from hat_ros.hypotheses.bank import (
     MAX_RADIUS,
+    N_RINGS,
     PolarSampler,
     ViewBank,
     border_grid,
@@ -198,6 +199,11 @@ def _is_inside(placement: Placement, shape: tuple[int, ...]) -> bool:
     reach = MAX_RADIUS * placement.gyration_px
     low, high = placement.center_px - reach, placement.center_px + reach
     return bool(low.min() >= 0 and high[0] <= shape[1] - 1 and high[1] <= shape[0] - 1)
+
+
+def rehearse(bank: ViewBank) -> None:
+    """Match nothing with a bank, so that everything is compiled before the first frame comes."""
+    _peaks(_correlate(bank, np.zeros((1, bank.n_angles, N_RINGS), np.float32)))
 
 
 @njit(cache=True, nogil=True)

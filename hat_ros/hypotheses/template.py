@@ -40,6 +40,7 @@ from hat_ros.hypotheses.matching import (
     match_light,
     match_shape,
     partial_placements,
+    rehearse,
     whole_placement,
 )
 from hat_ros.hypotheses.scoring import Scorer, light_score, log_score, shape_score
@@ -130,6 +131,8 @@ class TemplateHypotheses:
         renderer = create_renderer("embree", target)
         self._bank = load_or_build(target, renderer, options.n_views, options.n_angles)
         self._body_bank = load_or_build(target, renderer, options.n_views, options.n_angles, thin_parts=False)
+        for bank in (self._lit_bank, self._bank, self._body_bank):  # a bank just built is not typed like one from disk
+            rehearse(bank)
 
     def generate(self, frame: Frame, detection: Detection, prior: PosePrior | None) -> Candidates:
         """Up to K refined and scored poses, best first; zero rows when nothing fits."""

@@ -15,7 +15,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hat_ros import lie
 from hat_ros.refinement.view import Surfels, TargetViewer, View
+from hat_ros.types import Camera
 
 Float32 = NDArray[np.float32]
 
@@ -92,6 +94,7 @@ class SunMatcher:
         suns = _even_directions(_N_SUNS)
         self._suns = suns[suns[:, 2] < _MAX_BEHIND].astype(np.float32)
         self._encoded = brightness(np.linspace(0.0, 1.0, 257, dtype=np.float32))
+        self._rehearse()
 
     def match(self, view: View, field: LightField) -> Sunlight | None:
         """The sunlight in which a view of the target looks most like the image, None when it is out of the image."""
@@ -132,6 +135,16 @@ class SunMatcher:
         observed = field.smooth[v[:, None], u].reshape(-1, 3)[seen.pixel].astype(np.float32)
         beside = _light_beside(field.image, field.mask, field.box, view.mask, view.origin_px, view.scale)
         return _Scene(seen, observed, beside / (step * spacing_px) ** 2)
+
+    def _rehearse(self) -> None:
+        """Light up a made-up view of the target, so that everything is compiled before the first frame comes."""
+        side = 4 * _SIDE_POINTS
+        camera = Camera(np.array([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1.0]]), side, side)
+        target = self._viewer.target
+        T = lie.transform(np.eye(3), np.array([0, 0, 4 * target.bounding_radius_m]) - target.center_m)
+        view = self._viewer.view(T, camera, 2 * _SIDE_POINTS)
+        if view is not None:
+            self.match(view, LightField(np.full((side, side, 3), 255, np.uint8), np.ones((side, side), np.bool_)))
 
 
 def brightness(cosine: Float32) -> Float32:

@@ -48,6 +48,13 @@ def refine_outline(rgb: NDArray[np.uint8], mask: NDArray[np.uint8], band_px: int
     return np.where(inner == outer, mask, smooth)
 
 
+def rehearse() -> None:
+    """Move a made-up outline, so that everything is compiled before the first frame comes."""
+    mask = np.zeros((16, 16), np.uint8)
+    mask[4:12, 4:12] = 1
+    refine_outline(np.zeros((16, 16, 3), np.uint8), mask, 1, 1.0)
+
+
 def _every_second(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Every second pixel of every second row of an (h, w, ...) image, an odd rest dropped."""
     h, w = image.shape[0] // 2, image.shape[1] // 2

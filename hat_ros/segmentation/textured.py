@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from hat_ros.config import ClassicalConfig
 from hat_ros.segmentation import region
+from hat_ros.segmentation.boundary import rehearse
 from hat_ros.segmentation.ground import GroundEvidence
 from hat_ros.segmentation.masks import SIDES, Mask, Window, moved, overlap, shift_between, touched_sides
 from hat_ros.segmentation.search import (
@@ -41,6 +42,7 @@ class TexturedBackground:
         self._config = config
         self._bank = bank
         self._search = Search(config, bank)
+        rehearse()
         self.reset()
 
     def reset(self) -> None:

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from hat_ros import lie
 from hat_ros.config import HatConfig
+from hat_ros.render.embree import RayCaster
 from hat_ros.slam.surface import SurfacePrior
-from hat_ros.slam.tracks import PointTracks
+from hat_ros.slam.tracks import PointTracks, detect
 from hat_ros.slam.window import Window, rehearse
 from hat_ros.target import Target
 from hat_ros.types import Camera, Detection, Frame, Motion, PosePrior
@@ -54,11 +55,14 @@ class FeatureSlam:
         self._delay_frames = config.prior.delay_frames
         # In a whole scene the target is a small part: its surface would say little, and pull at everything.
         self._target = target if config.slam.feature.use_prior and self._masked else None
+        self._caster = None if self._target is None else RayCaster(self._target)
         self._epoch = 0
         self._camera: Camera | None = None
         self._forget()
         rehearse(self._config)
         depth_beside(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1))
+        blank = np.ones((32, 32), np.uint8)
+        detect(blank, blank, np.zeros((1, 2)), 1, self._config.spacing_px)
 
     def update(self, frame: Frame, detection: Detection | None, prior: PosePrior | None) -> Motion:
         """Advance by one frame.
@@ -119,7 +123,8 @@ class FeatureSlam:
             z -= _FIRST_BULGE * radius * (bulge(region, self._tracks.xy[slots]) - 0.5)
         self._window.place(slots, xn, z, _FIRST_SIGMA * radius)
         if self._target is not None:
-            self._surface = SurfacePrior(self._config, self._target, self._delay_frames)
+            radius_m = self._target.bounding_radius_m
+            self._surface = SurfacePrior(self._config, self._caster, radius_m, self._delay_frames)
             self._surface.remember(self._window, self._tracks.track_id)
         return self._motion()
 

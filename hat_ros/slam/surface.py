@@ -18,7 +18,6 @@ from hat_ros.config import FeatureSlamConfig
 from hat_ros.linear import robust_mean_rotation
 from hat_ros.render.embree import RayCaster
 from hat_ros.slam.window import Window
-from hat_ros.target import Target
 from hat_ros.types import PosePrior
 
 Float = NDArray[np.float64]
@@ -52,14 +51,17 @@ class SurfacePrior:
 
     Args:
         config: settings.
-        target: the CAD model.
+        caster: of the CAD model, which takes too long to build for a first frame.
+        bounding_radius_m: of the same.
         delay_frames: how many frames back the youngest prior lies.
     """
 
-    def __init__(self, config: FeatureSlamConfig, target: Target, delay_frames: int) -> None:
+    def __init__(
+        self, config: FeatureSlamConfig, caster: RayCaster, bounding_radius_m: float, delay_frames: int
+    ) -> None:
         self._config = config
-        self._caster = RayCaster(target)
-        self._sigma_m = config.surface_sigma * target.bounding_radius_m
+        self._caster = caster
+        self._sigma_m = config.surface_sigma * bounding_radius_m
         self._past: deque[_Past] = deque(maxlen=delay_frames + 2)
         self._rotation: dict[int, Float] = {}
         self._units_per_m: float | None = None

@@ -367,6 +367,7 @@ def rehearse(config: FeatureSlamConfig) -> None:
     window.place(np.arange(n), xn[:n], 1.0 + 0.01 * np.cos(3.0 * angle), 0.1)
     R, t, _ = window.locate(100_000_000, xn, seen)
     window.append(100_000_000, R, t, xn, seen)
+    window.predict(200_000_000)
     window.adjust()
     window.challenge_prior()
     window.emit()
