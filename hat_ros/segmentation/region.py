@@ -36,6 +36,10 @@ class ColorModels:
         """The same models, free to adapt differently."""
         return ColorModels(self.background.copy(), self.foreground.copy())
 
+    def adopt(self, other: ColorModels) -> None:
+        """Become like other models."""
+        self.background[:], self.foreground[:] = other.background, other.foreground
+
     @property
     def learned(self) -> bool:
         """Whether a cut has filled them."""

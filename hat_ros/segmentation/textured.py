@@ -82,7 +82,8 @@ class TexturedBackground:
                 return self._look_around(rgb, tracked) if self._since_check >= self._check_every else tracked
             if tracked is not None:
                 due = self._since_check >= (self._config.check_interval_frames if aided else self._check_every)
-                due = due or overlap(tracked, moved(masks[1], *shift_xy)) < _STEADY
+                doubtful = self._since_check >= _CHECK_UNAIDED_FRAMES
+                due = due or (doubtful and overlap(tracked, moved(masks[1], *shift_xy)) < _STEADY)
                 return self._cross_check(rgb, tracked, aided, silhouette) if due else tracked
         if trusted and silhouette is not None:
             found = self._search.around(rgb, silhouette)
@@ -178,8 +179,24 @@ class TexturedBackground:
         models: region.ColorModels,
         seen: GroundEvidence | None,
     ) -> region.ClearCut | None:
-        """Cut from reduced seeds, the last of them the previous mask; None when it leads away or loses contrast."""
-        cut = region.cut_from_seeds(window.rgb, seeds, margin * window.scale, models, seen)
+        """Cut from reduced seeds, the last of them the previous mask; None when it leads away or loses contrast.
+
+        What is seen of the ground helps, unless it leads away: a part of it that nobody knows yet looks like target.
+        """
+        if seen is not None:
+            aware = models.copy()
+            cut = region.cut_from_seeds(window.rgb, seeds, margin * window.scale, aware, seen)
+            clear = self._checked(window, seeds, cut, seen)
+            if clear is not None:
+                models.adopt(aware)
+                return clear
+        cut = region.cut_from_seeds(window.rgb, seeds, margin * window.scale, models)
+        return self._checked(window, seeds, cut, seen)
+
+    def _checked(
+        self, window: Window, seeds: list[Mask], cut: Mask | None, seen: GroundEvidence | None
+    ) -> region.ClearCut | None:
+        """A cut from seeds with its contrast; None when it leads away or loses contrast, and nobody vouches for it."""
         if cut is None:
             return None
         contrast = region.edge_contrast(region.color_step(window.rgb), cut)
