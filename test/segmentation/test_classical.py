@@ -5,6 +5,8 @@ from segmentation_scene import HEIGHT, WIDTH, frame, overlap, prior
 
 from hat_ros import lie
 from hat_ros.config import HatConfig
+from hat_ros.segmentation.ground import GroundEvidence, GroundMemory
+from hat_ros.segmentation.search import Search
 from hat_ros.segmentation.stage import SegmentationStage
 
 
@@ -200,6 +202,21 @@ def test_a_mask_locked_onto_the_ground_is_given_up(stage, scene):
     cv2.circle(wrong, (60, 60), 40, 1, -1)
     stage._backend._masks = (wrong, wrong)
     assert (run(stage, scene, lambda T, i: None, frames=20)[-10:] > 0.9).all()
+
+
+def test_ground_that_nobody_knew_does_not_lose_a_tracked_mask(stage, scene, monkeypatch):
+    """Everything new looks as if it stood before the ground; the mask goes on without that, and without a search."""
+    before = run(stage, scene, lambda T, i: None, frames=4)
+
+    def all_new(memory, window, length_px):
+        nothing = np.zeros(window.rgb.shape[:2], np.uint8)
+        return GroundEvidence(nothing + np.uint8(1), nothing, nothing)
+
+    monkeypatch.setattr(GroundMemory, "evidence", all_new)
+    monkeypatch.setattr(Search, "find", lambda search, rgb, open_sides: None)
+    after = run(stage, scene, lambda T, i: None, frames=6, start=4)
+    assert (before > 0.9).all()
+    assert (after > 0.9).all()
 
 
 def test_found_again_after_it_was_hidden(stage, scene):
