@@ -238,7 +238,9 @@ class RefinementConfig:
     max_shift: float = option(0.15, "and so is one that moves further, as a share of the range", low=0, high=1)
     min_overlap: float = option(0.6, "silhouette overlap with the mask that a supported pose needs", low=0, high=1)
     min_support: float = option(0.4, "share of the contour that must agree with the image", low=0, high=1)
-    same_pose_deg: float = option(5.0, "a start this close to a refined pose is not refined once more", low=0, high=180)
+    same_pose_deg: float = option(
+        5.0, "a start this close to another one, or to a supported pose, is not refined", low=0, high=180
+    )
     switch_margin: float = option(0.05, "lead in image evidence that a second start within a basin needs", low=0)
     arbitration_margin: float = option(0.15, "summed lead in image evidence that decides between basins", low=0)
     certain_share: float = option(0.9, "overlap and support that need no second anchor to be TRACKING", low=0, high=1)

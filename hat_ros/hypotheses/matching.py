@@ -26,6 +26,7 @@ from hat_ros.hypotheses.bank import (
     polar_grid,
     ring_weights,
 )
+from hat_ros.hypotheses.lit_bank import subdued
 from hat_ros.types import Camera
 
 # What silhouette without mask costs, against mask without silhouette = 1. A part that lies in shadow or outside the
@@ -125,9 +126,10 @@ def match_light(
 
     Args:
         bank: the target's views, each spectrum of unit norm.
-        light: (H, W) float32, black but for the target, not all black; subdued as the bank is.
+        light: (H, W) float32 of any scale, black but for the target, not all black.
         camera, n_best, separation_deg, center_m: as for :func:`match_shape`.
     """
+    light = subdued(light)
     placement = Placement(*image_moments(light))
     grid = polar_grid(light, placement.center_px, placement.gyration_px, bank.n_angles)
     norm = float(np.linalg.norm(grid))

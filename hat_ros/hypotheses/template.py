@@ -31,7 +31,7 @@ from hat_ros.config import HatConfig
 from hat_ros.errors import ConfigError
 from hat_ros.hypotheses.bank import ViewBank, load_or_build, without_thin_parts
 from hat_ros.hypotheses.box import silhouette_in_box
-from hat_ros.hypotheses.lit_bank import load_or_build_lit, subdued
+from hat_ros.hypotheses.lit_bank import load_or_build_lit
 from hat_ros.hypotheses.matching import (
     Placement,
     ShapeMatches,
@@ -213,12 +213,7 @@ class TemplateHypotheses:
         if light is None:
             return []
         matches = match_light(
-            self._lit_bank,
-            subdued(light),
-            frame.camera,
-            options.n_coarse_lit,
-            options.separation_deg,
-            self._target.center_m,
+            self._lit_bank, light, frame.camera, options.n_coarse_lit, options.separation_deg, self._target.center_m
         )
         return list(matches.T_cam_target)
 

@@ -256,9 +256,7 @@ class PoseFitter:
     def _rehearse(self) -> None:
         """Fit the target to a made-up mask, so that everything is compiled before the first frame comes."""
         side = 2 * _CENTRING_PX
-        camera = Camera(np.array([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1.0]]), side, side)
-        target = self.viewer.target
-        T = lie.transform(np.eye(3), np.array([0, 0, 4 * target.bounding_radius_m]) - target.center_m)
+        camera, T = self.viewer.made_up(side)
         image = np.zeros((side, side, 3), np.uint8)
         mask = np.zeros((side, side), np.bool_)
         mask[side // 4 : -side // 4, side // 4 : -side // 4] = True

@@ -15,9 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from hat_ros import lie
 from hat_ros.refinement.view import Surfels, TargetViewer, View
-from hat_ros.types import Camera
 
 Float32 = NDArray[np.float32]
 
@@ -139,9 +137,7 @@ class SunMatcher:
     def _rehearse(self) -> None:
         """Light up a made-up view of the target, so that everything is compiled before the first frame comes."""
         side = 4 * _SIDE_POINTS
-        camera = Camera(np.array([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1.0]]), side, side)
-        target = self._viewer.target
-        T = lie.transform(np.eye(3), np.array([0, 0, 4 * target.bounding_radius_m]) - target.center_m)
+        camera, T = self._viewer.made_up(side)
         view = self._viewer.view(T, camera, 2 * _SIDE_POINTS)
         if view is not None:
             self.match(view, LightField(np.full((side, side, 3), 255, np.uint8), np.ones((side, side), np.bool_)))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from hat_ros import lie
 from hat_ros.refinement.contour import (
     COL_INSIDE,
     COL_NU,
@@ -96,6 +97,12 @@ class TargetViewer:
             self._hull_m = target.vertices_m[ConvexHull(target.vertices_m).vertices]
         except QhullError:  # a flat model
             self._hull_m = target.vertices_m
+
+    def made_up(self, side_px: int) -> tuple[Camera, NDArray[np.float64]]:
+        """Square camera and a (4, 4) pose at which it sees the whole target, to rehearse with."""
+        camera = Camera(np.array([[side_px, 0, side_px / 2], [0, side_px, side_px / 2], [0, 0, 1.0]]), side_px, side_px)
+        center_m = np.array([0.0, 0.0, 4.0 * self.target.bounding_radius_m])
+        return camera, lie.transform(np.eye(3), center_m - self.target.center_m)
 
     def view(
         self,
