@@ -19,6 +19,9 @@ _NO_ORIGIN = np.zeros(2)
 _SAME_CONTOUR_PX = 1.0
 # A contour point agrees with the image when its edge or the mask's boundary lies this close, pixels.
 _AGREE_PX = 2.5
+# How much an edge must count by itself to say that the target is there. With a mask that is known, and a step too small
+# for an edge, as on black before black, does not speak against a pose.
+_MIN_EDGE = 0.1
 # Damping while only the mask's outline is known and the start is far off.
 _PULL_DAMPING = 1e-3
 
@@ -97,8 +100,9 @@ class Fit:
         total = length[inside].sum()
         if total <= 0:
             return 0.0
-        edge = (self.contour[:, 4] > 0) & (np.abs(self.contour[:, 3]) < _AGREE_PX)
         mask = (self.contour[:, 2] > 0) & (np.abs(self.contour[:, 1]) < _AGREE_PX)
+        least = 0.0 if self.contour[:, 2].any() else _MIN_EDGE
+        edge = (self.contour[:, 4] > least) & (np.abs(self.contour[:, 3]) < _AGREE_PX)
         return float(length[inside & (edge | mask)].sum() / total)
 
 

@@ -1,28 +1,33 @@
 """Segmentation without weights: ``segmentation.backend: classical``.
 
-Before black sky a threshold finds what is lit (:mod:`hat_ros.segmentation.lit`). Before anything else (Earth, clouds, a
-laboratory) a graph cut separates the target, seeded by the previous mask and by the silhouette of the predicted pose,
-or from nothing (:mod:`hat_ros.segmentation.textured`). What it says is checked against the CAD model's silhouettes and
-against how the background moves, and a tracked mask now and then against an independent search, so that a wrong mask
-does not keep itself alive.
+Before black sky a threshold finds what is lit (:mod:`hat_ros.segmentation.lit`), after stray light has been taken off
+(:mod:`hat_ros.segmentation.glow`). Before anything else (Earth, clouds, a laboratory) a graph cut separates the target,
+seeded by the previous mask and by the silhouette of the predicted pose, or from nothing
+(:mod:`hat_ros.segmentation.textured`). What it says is checked against the CAD model's silhouettes and against how the
+background moves, and a tracked mask now and then against an independent search, so that a wrong mask does not keep
+itself alive.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hat_ros.config import HatConfig
 from hat_ros.render.embree import EmbreeRenderer
+from hat_ros.segmentation.glow import fades_out, without_glow
 from hat_ros.segmentation.lit import LitBody
 from hat_ros.segmentation.masks import Mask, enlarge, overlap
 from hat_ros.segmentation.shape import SilhouetteBank
-from hat_ros.segmentation.sky import dark_border_share, lit_regions, measure_sky
+from hat_ros.segmentation.sky import Sky, dark_border_share, lit_regions, measure_sky
 from hat_ros.segmentation.textured import TexturedBackground
 from hat_ros.target import Target
 from hat_ros.types import Detection, Frame, PosePrior
 
+_STRAY_SHARE = 0.5  # of the dark border that a black sky has is left where stray light falls on it
 _LEAP = 0.6  # share of that overlap below which a mask is not believed ...
 _MAX_LEAPS = 4  # ... for so many frames
+_MAX_GROWTH = 1.6  # of what is lit, over the silhouette
 
 
 class ClassicalSegmenter:
@@ -54,29 +59,50 @@ class ClassicalSegmenter:
         silhouette = self._silhouette(frame, prior)
         supported = prior is not None and prior.supported
         certain = prior is not None and prior.healthy  # what is dark is added only where the basin is beyond doubt
-        mask, black, regions = None, False, []
-        if dark_border_share(frame.rgb) >= self._config.sky_border_share:
-            measured = measure_sky(frame.rgb)
-            black = measured.border_share >= self._config.sky_border_share
-            regions = lit_regions(measured) if black else []
+        measured, regions = self._before_black_sky(frame.rgb)
+        mask = None
         if regions:
             mask = self._lit.find(measured, regions, self._masks[1], silhouette if certain else None)
-        if mask is None and (regions or not black):
+        lit = mask is not None
+        if mask is None and (regions or measured is None):
             mask = self._textured.find(frame.rgb, self._masks, silhouette, supported)
-        if mask is not None and (not mask.any() or (certain and self._leaps(mask, silhouette))):
+        if mask is not None and (not mask.any() or (certain and self._leaps(mask, silhouette, lit))):
             mask = None
         self._masks = (self._masks[1], mask)
         return None if mask is None else Detection(mask.astype(bool))
 
-    def _leaps(self, mask: Mask, silhouette: Mask | None) -> bool:
+    def _before_black_sky(self, rgb: NDArray[np.uint8]) -> tuple[Sky | None, list[Mask]]:
+        """The sky and the bright regions before it, once more without stray light where that is in the way.
+
+        No sky where the border is not mostly black, and no regions where nothing stands out.
+        """
+        required = self._config.sky_border_share
+        dark = dark_border_share(rgb)
+        measured = measure_sky(rgb) if dark >= required else None
+        if measured is not None and measured.border_share >= required:
+            regions = lit_regions(measured)
+            if not regions or not fades_out(measured, regions[0]):
+                return measured, regions
+        elif dark < _STRAY_SHARE * required:
+            return None, []
+        cleared = measure_sky(without_glow(rgb))
+        if cleared.border_share >= required:
+            return cleared, lit_regions(cleared)
+        if measured is not None and measured.border_share >= required:
+            return measured, regions
+        return None, []
+
+    def _leaps(self, mask: Mask, silhouette: Mask | None, lit: bool) -> bool:
         """Whether a mask suddenly leaves a silhouette beyond doubt that the masks so far have filled.
 
-        The ground comes and goes in a frame, a target does not. What lasts is taken for true after a few frames.
+        The ground comes and goes in a frame, a target does not. What lasts is taken for true after a few frames. What
+        is ``lit`` before a black sky has moved, unless it has grown: then it has met something else.
         """
         if silhouette is None:
             return False
         filled = overlap(mask, silhouette)
-        if self._n_leaps < _MAX_LEAPS and filled < _LEAP * self._filled:
+        moved = lit and np.count_nonzero(mask) <= _MAX_GROWTH * np.count_nonzero(silhouette)
+        if not moved and self._n_leaps < _MAX_LEAPS and filled < _LEAP * self._filled:
             self._n_leaps += 1
             return True
         self._filled, self._n_leaps = filled, 0

@@ -6,6 +6,7 @@ from shape_scene import CAMERA, picture, pose_errors, random_pose, spacecraft, s
 
 from hat_ros import lie
 from hat_ros.config import HatConfig, RefinementConfig
+from hat_ros.core.refined import is_supported
 from hat_ros.refinement import create_refiner
 from hat_ros.refinement.sunlight import Sunlight, SunMatcher
 from hat_ros.target import target_from_scene
@@ -178,6 +179,17 @@ def test_a_pose_of_another_basin_is_never_turned_into_this_one(refiner, target):
 def test_a_blank_image_refines_nothing(refiner, target, level):
     frame = Frame(1, np.full((CAMERA.height, CAMERA.width, 3), level, np.uint8), CAMERA)
     assert refiner.refine(frame, None, random_pose(np.random.default_rng(0), target)) is None
+
+
+@pytest.mark.parametrize("sigma", [0.5, 1.5, 4.0])
+def test_noise_supports_no_pose(refiner, target, sigma):
+    """Every line across noise has a step somewhere; a target that has left the image must not seem to be there."""
+    rng = np.random.default_rng(3)
+    noise = rng.normal(3.0, sigma, (CAMERA.height, CAMERA.width, 3))
+    frame = Frame(1, np.clip(np.rint(noise), 0, 255).astype(np.uint8), CAMERA)
+    for _ in range(5):
+        refined = refiner.refine(frame, None, random_pose(rng, target))
+        assert not is_supported(refined, ENABLED.refinement)
 
 
 def test_a_pose_behind_the_camera_is_no_error(refiner, target):

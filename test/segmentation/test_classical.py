@@ -55,6 +55,14 @@ def test_a_far_target_keeps_its_size(stage, scene):
     assert abs(bias_px(mask, scene.truth(T))) < 0.3
 
 
+def test_a_camera_that_turns_fast_does_not_lose_a_lit_body(stage, scene):
+    """However sure the prediction is: before a black sky nothing else looks like the target."""
+    for i, x in enumerate((-1.0, -1.0, 0.6)):
+        T = scene.pose(0.3, x=x)
+        found = stage.update(frame(i, scene.image(T)), prior(scene.pose(0.3, x=-1.0)))
+    assert overlap(found.mask, scene.truth(T)) > 0.93
+
+
 def test_a_target_cut_by_the_border_is_found(stage, scene):
     T = scene.pose(0.3, x=-1.9)
     found = stage.update(frame(0, scene.image(T)), None)
