@@ -16,6 +16,7 @@ from hat_ros.segmentation.boundary import refine_outline
 from hat_ros.segmentation.ground import CLEAR, GroundMemory
 from hat_ros.segmentation.masks import Mask, Window, overlap, shrink, touched_sides, touches_border
 from hat_ros.segmentation.motion import MotionDetector, MotionEvidence
+from hat_ros.segmentation.outlines import SharpOutlines, is_grey
 from hat_ros.segmentation.shape import SilhouetteBank
 
 MIN_CONTRAST = 8.0  # 8-bit colour step across the outline below which there is no outline
@@ -30,6 +31,8 @@ _MOTION_RELIEF = 0.1  # ... a mask that motion could have spoken against needs l
 _COARSE_BENEFIT = 0.15  # ... and one that misses this little gets a closer look; ...
 CUT_SURCHARGE = 0.1  # ... one that the border cuts needs more, since part of a silhouette fits many things.
 _UNMOVED_SURCHARGE = 0.16
+# Where there is no colour a mask is the more plausible the more of the sharp outlines it holds, beyond this share.
+_SHARP_WEIGHT, _SHARP_USUAL = 0.3, 0.6
 _GROUND_RELIEF = 0.25  # what stands before ground known all around needs still less
 _GROUND_SIDE_PX = 160  # longer side of the image searched for it
 _GAP_PX = 5  # between pieces of one target
@@ -73,6 +76,14 @@ class _Newest:
     def motion(self) -> MotionEvidence | None:
         """What moved."""
         return self.detector.evidence()
+
+    @cached_property
+    def sharp(self) -> SharpOutlines | None:
+        """The sharp outlines of an image without colour."""
+        if not is_grey(self.remembered.rgb):
+            return None
+        grey = np.ascontiguousarray(self.remembered.rgb[..., 0])
+        return SharpOutlines(grey, (self.window.rgb.shape[1], self.window.rgb.shape[0]))
 
 
 class Search:
@@ -134,7 +145,8 @@ class Search:
             return found
         whole = self._newest.window
         motion = self._newest.motion
-        cuts = _cold_cuts(whole.rgb, motion, open_sides)
+        sharp = self._newest.sharp
+        cuts = _cold_cuts(whole.rgb, motion, open_sides) + (sharp.cuts() if sharp is not None else [])
         # Without motion an open side may let the background in: the first, closed cut is the safest.
         margin = OPEN_BETTER if motion is None else 0.0
         best, best_score = None, -np.inf
@@ -155,12 +167,15 @@ class Search:
         if window is None:
             return None
         models = region.ColorModels()
-        cut = region.cut_from_seeds(window.rgb, [window.reduce(mask)], margin * window.scale, models)
+        seed = window.reduce(mask)
+        cut = region.cut_from_seeds(window.rgb, [seed], margin * window.scale, models)
+        if sharp is not None and (cut is None or self._shape(cut) < self._shape(seed)):
+            cut = seed  # greys alone find less than outlines did
         if cut is None:
             return None
         if best_score < required:
             # A small target's shape is lost at the scale of the search: judge what a closer look finds.
-            best_score += self._bank.overlap(cut.astype(bool)) - self._bank.overlap(best.astype(bool))
+            best_score += self._shape(cut) - self._shape(best)
             if best_score < required:
                 return None
         contrast = region.edge_contrast(region.color_step(window.rgb), cut)
@@ -199,7 +214,7 @@ class Search:
         kernel = np.ones((_GAP_PX, _GAP_PX), np.uint8)
         joined = cv2.morphologyEx(seen.target, cv2.MORPH_CLOSE, kernel)
         pieces = [piece for piece in (region.tidy(joined, None), region.tidy(joined, joined)) if piece is not None]
-        piece = max(pieces, key=lambda piece: self._bank.overlap(piece.astype(bool)), default=None)
+        piece = max(pieces, key=self._shape, default=None)
         if piece is None:
             return None
         x, y, w, h = cv2.boundingRect(whole.enlarge(piece))
@@ -217,7 +232,7 @@ class Search:
         )
         if cut is None or not seen.vouches_for(cut):
             return None
-        plausibility = self._bank.overlap(cut.astype(bool))
+        plausibility = self._shape(cut)
         if plausibility < self._config.min_shape_overlap - _GROUND_RELIEF:
             return None
         contrast = region.edge_contrast(region.color_step(window.rgb), cut)
@@ -225,13 +240,21 @@ class Search:
 
     def _plausibility(self, mask: Mask, motion: MotionEvidence | None) -> float:
         """How well a mask at the scale of a search is explained: its overlap with the nearest CAD silhouette, less
-        the doubt that motion raises: where something moves it is not, or what it holds moves with the background."""
+        the doubt that motion raises: where something moves it is not, or what it holds moves with the background; and
+        that sharp outlines beside it raise where there is no colour."""
         doubt = 0.0
+        found = None if self._newest.sharp is None else self._newest.sharp.found_share(mask)
+        if found is not None:
+            doubt += _SHARP_WEIGHT * (_SHARP_USUAL - found)
         if motion is not None:
             found = motion.found_share(mask)
             doubt += max(0.0, _MIN_FOUND - found) + _FOUND_BONUS * (1.0 - found)
             doubt += max(0.0, motion.still_share(mask) - _MAX_STILL)
-        return self._bank.overlap(mask.astype(bool)) - doubt
+        return self._shape(mask) - doubt
+
+    def _shape(self, mask: Mask) -> float:
+        """Overlap of a mask with the nearest CAD silhouette."""
+        return self._bank.overlap(mask.astype(bool))
 
     def _required(self, mask: Mask, motion: MotionEvidence | None) -> float:
         """Plausibility that a mask needs: less where motion has its say, more where the border hides a part."""
