@@ -24,7 +24,7 @@ from hat_ros.segmentation.textured import TexturedBackground
 from hat_ros.target import Target
 from hat_ros.types import Detection, Frame, PosePrior
 
-_STRAY_SHARE = 0.5  # of the dark border that a black sky has is left where stray light falls on it
+_STRAY_SHARE = 0.85  # of the dark border that a black sky has is left at least where stray light falls on it
 _LEAP = 0.6  # share of that overlap below which a mask is not believed ...
 _MAX_LEAPS = 4  # ... for so many frames
 _MAX_GROWTH = 1.6  # of what is lit, over the silhouette
@@ -78,19 +78,19 @@ class ClassicalSegmenter:
         """
         required = self._config.sky_border_share
         dark = dark_border_share(rgb)
-        measured = measure_sky(rgb) if dark >= required else None
-        if measured is not None and measured.border_share >= required:
-            regions = lit_regions(measured)
-            if not regions or not fades_out(measured, regions[0]):
-                return measured, regions
-        elif dark < _STRAY_SHARE * required:
+        if dark < _STRAY_SHARE * required:
             return None, []
+        measured = measure_sky(rgb)
+        black = measured.border_share >= required
+        regions = lit_regions(measured) if black else []
+        if black and (not regions or not fades_out(measured, regions[0])):
+            return measured, regions
         cleared = measure_sky(without_glow(rgb))
         if cleared.border_share >= required:
-            return cleared, lit_regions(cleared)
-        if measured is not None and measured.border_share >= required:
-            return measured, regions
-        return None, []
+            sharp = lit_regions(cleared)
+            if not sharp or not fades_out(cleared, sharp[0]):
+                return cleared, sharp
+        return (measured, regions) if black else (None, [])
 
     def _leaps(self, mask: Mask, silhouette: Mask | None, lit: bool) -> bool:
         """Whether a mask suddenly leaves a silhouette beyond doubt that the masks so far have filled.

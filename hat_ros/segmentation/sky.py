@@ -16,6 +16,7 @@ from hat_ros.segmentation.masks import fill_holes, touches_border
 
 # A sky pixel is at most this bright (8-bit, any channel); black level and noise of real cameras stay below.
 SKY_MAX = 48
+_SKY_MAX_CHROMA = 16  # between its brightest channel and its darkest: a dark sea is blue
 _RING_PX = 8  # width of the image border that is looked at for the sky
 _NOISE_SIGMAS = 5.0
 _MIN_STEP = 1.5  # smallest excess over the sky that counts, for noise-free images
@@ -91,9 +92,10 @@ def dark_border_share(rgb: NDArray[np.uint8]) -> float:
 
 
 def _dark_border(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Which pixels of the border are black in every channel (a dark sea is blue)."""
+    """Which pixels of the border are black in every channel, and have no colour."""
     red, green, blue = np.concatenate([rgb[strip].reshape(-1, 3) for strip in _border(rgb.shape)]).T
-    return np.maximum(np.maximum(red, green), blue) < SKY_MAX
+    brightest = np.maximum(np.maximum(red, green), blue)
+    return (brightest < SKY_MAX) & (brightest - np.minimum(np.minimum(red, green), blue) < _SKY_MAX_CHROMA)
 
 
 def _border(shape: tuple[int, ...]) -> tuple[tuple[slice, slice], ...]:
