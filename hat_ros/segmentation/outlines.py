@@ -21,7 +21,7 @@ from hat_ros.segmentation.region import tidy
 _SHARP_SHARES = (0.16, 0.2, 0.25)
 _JUDGED = 1
 _RANGE_PERCENT = (1, 99)
-_MIN_RANGE = 20.0
+_MIN_RANGE = 40.0
 # Gaps bridged between outlines, as radii in pixels of a picture whose longer side has 320.
 _BRIDGED_PX = (2, 4, 7, 11)
 _PICTURE_SIDE_PX = 320
@@ -55,13 +55,15 @@ class SharpOutlines:
         self._scale = max(grey.shape) / _PICTURE_SIDE_PX
         self._size = size
 
-    def found_share(self, mask: Mask) -> float | None:
-        """Share of the sharp outlines that a 0/1 mask holds; None where there are hardly any."""
+    def held_beyond_chance(self, mask: Mask) -> float | None:
+        """Share of the sharp outlines that a 0/1 mask holds, less its share of the picture, which it would hold if they
+        lay anywhere; None where there are hardly any."""
         total = np.count_nonzero(self._judged)
         if total < _FEW:
             return None
         side = 2 * _BESIDE_PX + 1
-        return np.count_nonzero(self._judged & cv2.dilate(mask, np.ones((side, side), np.uint8))) / total
+        held = np.count_nonzero(self._judged & cv2.dilate(mask, np.ones((side, side), np.uint8)))
+        return held / total - np.count_nonzero(mask) / mask.size
 
     def cuts(self) -> list[Mask]:
         """What lies among sharp outlines: the largest piece for every sharpness and every gap bridged."""
@@ -87,7 +89,7 @@ class SharpOutlines:
         for radius in radii:
             grown = (distance <= radius).astype(np.uint8)
             closed = cv2.distanceTransform(grown, cv2.DIST_L2, 3)[margin:-margin, margin:-margin] > radius
-            body = fill_holes(closed.astype(np.uint8), 1.0)
+            body = fill_holes(closed.astype(np.uint8), np.inf)
             body = tidy(cv2.morphologyEx(body, cv2.MORPH_OPEN, _K3), None)
             large = body is not None and np.count_nonzero(body) >= _MIN_AREA_PX * self._scale**2
             out.append(self._reduced(body) if large else None)

@@ -243,9 +243,9 @@ class Search:
         the doubt that motion raises: where something moves it is not, or what it holds moves with the background; and
         that sharp outlines beside it raise where there is no colour."""
         doubt = 0.0
-        found = None if self._newest.sharp is None else self._newest.sharp.found_share(mask)
-        if found is not None:
-            doubt += _SHARP_WEIGHT * (_SHARP_USUAL - found)
+        held = None if self._newest.sharp is None else self._newest.sharp.held_beyond_chance(mask)
+        if held is not None:
+            doubt += _SHARP_WEIGHT * (_SHARP_USUAL - held)
         if motion is not None:
             found = motion.found_share(mask)
             doubt += max(0.0, _MIN_FOUND - found) + _FOUND_BONUS * (1.0 - found)

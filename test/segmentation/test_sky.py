@@ -1,7 +1,7 @@
 import cv2
 import numpy as np
 
-from hat_ros.segmentation.sky import bridge_gaps, lit_share
+from hat_ros.segmentation.sky import bridge_gaps, dark_border_share, lit_share
 
 
 def _discs(radius_px):
@@ -37,3 +37,9 @@ def test_wider_bridges_cover_what_narrower_ones_do():
     _, options = bridge_gaps(_discs(5), 96)
     areas = [np.count_nonzero(option) for option in options]
     assert areas == sorted(areas) and areas[-1] > 1.5 * areas[0]
+
+
+def test_a_dark_sea_is_no_black_sky():
+    sea = np.full((120, 160, 3), (4, 15, 32), np.uint8)
+    assert dark_border_share(sea) == 0.0
+    assert dark_border_share(np.full((120, 160, 3), (14, 15, 18), np.uint8)) == 1.0
