@@ -17,25 +17,28 @@ class KeyframeSchedule:
     Our extension: while a track is settled, an absolute estimate has little to add, and the gap is
     ``settled_factor`` times as long; and an attempt in vain is repeated as many times sooner, since a wrong start
     stands until then: a first one that decided nothing, or any on a detection that soon turned out to be of something
-    else. The paper's spacing is a factor of 1.
+    else. Frames that were left out count as well. The paper's spacing is a factor of 1.
     """
 
     def __init__(self, config: KeyframeConfig) -> None:
         self._gap_frames = config.gap_frames
         self._early_gap_frames = max(1, config.gap_frames // config.settled_factor)
+        self._counts_missed = config.settled_factor > 1
         self._settled_gap_frames = config.gap_frames * config.settled_factor
         self.reset()
 
-    def update(self, has_detection: bool, healthy: bool = False, in_vain: bool = False) -> bool:
+    def update(self, has_detection: bool, healthy: bool = False, in_vain: bool = False, n_missed: int = 0) -> bool:
         """Count one input frame; True when candidates are to be generated for it.
 
         Args:
             has_detection: the target has been found in the image.
             healthy: the fused state of the past, as the prior of this frame tells it, is TRACKING.
             in_vain: what the last attempt was made on turned out to be a part of the target, or something else.
+            n_missed: frames left out right before this one; after a whole gap of them no track is settled.
         """
-        self._frames_since_attempt += 1
-        if not healthy:
+        n_missed = n_missed if self._counts_missed else 0
+        self._frames_since_attempt += 1 + n_missed
+        if not healthy or n_missed >= self._gap_frames:
             self._healthy_attempts = 0
         settled = self._healthy_attempts >= SETTLING_ATTEMPTS
         gap_frames = self._settled_gap_frames if settled else self._gap_frames

@@ -31,6 +31,7 @@ from hat_ros import lie
 from hat_ros.config import HatConfig, RefinementConfig
 from hat_ros.core.alignment import SlamAlignment
 from hat_ros.core.attitude import AttitudeFilter
+from hat_ros.core.cadence import Cadence
 from hat_ros.core.causal import Dissent, Fused, fuse_two, relative_motion
 from hat_ros.core.prior import extrapolate
 from hat_ros.core.refiner import Refiner
@@ -42,6 +43,8 @@ _CLOSE_SHARE = 0.5
 # A wrong pose hardly ever explains an image well, and its lead among other poor ones says little: a track with evidence
 # that never came this far needs so many agreeing anchors, since masks err alike at successive keyframes.
 _EXPLAINED_QUALITY, _WITNESSES = 0.83, 3
+# So many frames left out in a row carry a target out of its basin: what vouched for the track before is void.
+_INTERRUPTION_FRAMES = 5
 # Measured outputs behind the constant-rate prediction.
 _RATE_HISTORY = 6
 
@@ -60,6 +63,7 @@ class RefinedFusion:
         self.alignment = SlamAlignment(config.alignment)
         self._dissent = Dissent(config.fusion.gate_angle_deg, config.alignment.reset_anchors)
         self._attitude = AttitudeFilter(np.radians(config.refinement.start_sigma_deg))
+        self._cadence = Cadence()
         self._lead = 0.0
         self._epoch = 0
         self.lose()
@@ -97,6 +101,8 @@ class RefinedFusion:
         if motion.epoch != self._epoch:
             self._epoch = motion.epoch
             self.alignment.reset()
+        if self._cadence.missed(frame.stamp_ns) >= _INTERRUPTION_FRAMES:
+            self._start_track()
         predictions = self._predictions(frame.stamp_ns, motion)
         fused = self._decide(frame, detection, predictions, anchor, confidence, decided)
         if fused.reset:

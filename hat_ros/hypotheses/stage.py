@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hat_ros.config import HatConfig
+from hat_ros.core.cadence import Cadence
 from hat_ros.core.guard import guard_candidates
 from hat_ros.core.keyframes import KeyframeSchedule
 from hat_ros.stages import create_backend
@@ -29,6 +30,7 @@ class HypothesisStage:
         self._max_candidates = config.hypotheses.max_candidates
         self._drop_implausible = config.hypotheses.guard
         self._schedule = KeyframeSchedule(config.keyframes)
+        self._cadence = Cadence()
         self._apart_deg, self._min_lead = config.fusion.gate_angle_deg, config.refinement.min_margin
         self._backend = create_backend("hypotheses", config, target)
         self._newest: Detection | None = None
@@ -43,7 +45,8 @@ class HypothesisStage:
         healthy = prior is not None and prior.healthy
         self._observe(detection)
         in_vain = self._changed and (prior is None or not prior.supported)
-        if not self._schedule.update(detection is not None, healthy, in_vain) or detection is None:
+        n_missed = self._cadence.missed(frame.stamp_ns)
+        if not self._schedule.update(detection is not None, healthy, in_vain, n_missed) or detection is None:
             return Candidates.none()
         self._changed = False
         candidates = self._backend.generate(frame, detection, prior)
@@ -57,6 +60,7 @@ class HypothesisStage:
     def reset(self) -> None:
         """Forget earlier frames; the next frame with a detection is a keyframe."""
         self._schedule.reset()
+        self._cadence.reset()
         self._backend.reset()
         self._newest, self._changed = None, False
 

@@ -66,3 +66,16 @@ def test_an_attempt_on_something_else_is_soon_repeated():
     assert [i for i in range(20) if schedule.update(True, in_vain=i in (1, 2, 9, 10))] == [0, 2, 8, 10, 16]
     schedule = KeyframeSchedule(KeyframeConfig(gap_frames=6))
     assert [i for i in range(20) if schedule.update(True, in_vain=i > 0)] == [0, 6, 12, 18]
+
+
+def test_frames_left_out_count_and_unsettle_the_track():
+    schedule = KeyframeSchedule(KeyframeConfig(gap_frames=4, settled_factor=3))
+    missed = {15: 2, 22: 1, 25: 6}
+    asked = [i for i in range(36) if schedule.update(True, healthy=True, n_missed=missed.get(i, 0))]
+    # Settled from 8 on: 12 frames to 18, 2 of them left out; after 6 more the next is due at once, the gap 4 again.
+    assert asked == [0, 4, 8, 18, 25, 29, 33]
+
+
+def test_frames_left_out_do_not_count_with_a_factor_of_one():
+    schedule = KeyframeSchedule(KeyframeConfig(gap_frames=4))
+    assert [i for i in range(10) if schedule.update(True, n_missed=3)] == [0, 4, 8]

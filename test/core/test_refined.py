@@ -191,6 +191,15 @@ def test_an_uncertain_start_is_tracking_only_after_a_second_anchor_agreed(scene)
     assert {e.state for e in certain} == {TrackState.TRACKING}
 
 
+@pytest.mark.parametrize(("n_missed", "in_doubt"), [(1, 0), (6, 6)])
+def test_after_an_interruption_somebody_must_speak_for_the_track_again(scene, n_missed, in_doubt):
+    """The target went on turning where nobody looked."""
+    frames = [*range(20), *range(20 + n_missed, 40)]
+    estimates = _run(_stage(scene, lambda index: {"true": (0.85, 0.85)}), scene, frames)
+    doubt = [i for i, e in zip(frames, estimates, strict=True) if i >= 8 and e.state != TrackState.TRACKING]
+    assert doubt == list(range(26, 26 + in_doubt))
+
+
 @pytest.mark.parametrize(("explained_at", "tracking_from"), [(None, 24), (4, 4), (12, 12)])
 def test_a_mask_that_was_never_explained_well_needs_three_more_anchors(scene, explained_at, tracking_from):
     """However far the decoder's lead: a wrong mask errs alike at two keyframes, but no pose explains it well."""
