@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 
 from hat_ros.segmentation.masks import fill_holes, touches_border
 
-# A sky pixel is at most this bright (8-bit, any channel); black level and noise of real cameras stay below.
+# A sky pixel is at most this bright (8-bit, any channel); black level and noise of real cameras stay below. In an image
+# exposed so that nothing is bright, ground is as dark: there this share of the brightest pixel, but not less than that.
 SKY_MAX = 48
+_SKY_MAX_SHARE, _SKY_MAX_LEAST = 0.15, 12
 _SKY_MAX_CHROMA = 16  # between its brightest channel and its darkest: a dark sea is blue
 _RING_PX = 8  # width of the image border that is looked at for the sky
 _NOISE_SIGMAS = 5.0
@@ -95,7 +97,8 @@ def _dark_border(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """Which pixels of the border are black in every channel, and have no colour."""
     red, green, blue = np.concatenate([rgb[strip].reshape(-1, 3) for strip in _border(rgb.shape)]).T
     brightest = np.maximum(np.maximum(red, green), blue)
-    return (brightest < SKY_MAX) & (brightest - np.minimum(np.minimum(red, green), blue) < _SKY_MAX_CHROMA)
+    limit = np.clip(_SKY_MAX_SHARE * rgb.max(), _SKY_MAX_LEAST, SKY_MAX)
+    return (brightest < limit) & (brightest - np.minimum(np.minimum(red, green), blue) < _SKY_MAX_CHROMA)
 
 
 def _border(shape: tuple[int, ...]) -> tuple[tuple[slice, slice], ...]:

@@ -1,5 +1,6 @@
 import cv2
 import numpy as np
+import pytest
 
 from hat_ros.segmentation.sky import bridge_gaps, dark_border_share, lit_share
 
@@ -39,7 +40,21 @@ def test_wider_bridges_cover_what_narrower_ones_do():
     assert areas == sorted(areas) and areas[-1] > 1.5 * areas[0]
 
 
-def test_a_dark_sea_is_no_black_sky():
-    sea = np.full((120, 160, 3), (4, 15, 32), np.uint8)
-    assert dark_border_share(sea) == 0.0
-    assert dark_border_share(np.full((120, 160, 3), (14, 15, 18), np.uint8)) == 1.0
+def _image(border, brightest):
+    image = np.full((120, 160, 3), border, np.uint8)
+    image[50:70, 60:90] = brightest
+    return image
+
+
+@pytest.mark.parametrize(
+    ("border", "brightest", "is_sky"),
+    [
+        ((1, 1, 1), 30, True),
+        ((14, 15, 18), 200, True),  # a raised black level
+        ((4, 15, 32), 200, False),  # a dark sea is blue, ...
+        ((15, 15, 15), 89, False),  # ... or not so dark beside what is lit
+        ((43, 43, 43), 230, False),
+    ],
+)
+def test_a_dark_sea_is_no_black_sky(border, brightest, is_sky):
+    assert dark_border_share(_image(border, brightest)) == float(is_sky)
