@@ -115,6 +115,10 @@ def _add_synth(commands: Commands) -> None:
     )
     film.add_argument("--exposure", type=float, default=0.85, help="brightness of a white face square to the sun")
     film.add_argument("--noise", type=float, default=0.0008, help="read noise, share of full scale")
+    film.add_argument("--monochrome", action="store_true", help="a grey sensor")
+    film.add_argument(
+        "--glare", type=float, default=0.0, metavar="0..1", help="stray light of a sun at the upper right, its peak"
+    )
     film.add_argument("--stars", type=natural, default=0, metavar="N", help="stars in the field")
     film.add_argument("--background", choices=("black", "earth", "table"), default="black", help="behind the target")
     film.add_argument(
@@ -185,6 +189,8 @@ def _filmed(arguments: argparse.Namespace) -> Clip:
         star_count=arguments.stars,
         earth=Earth() if arguments.background == "earth" else None,
         table=arguments.background == "table",
+        monochrome=arguments.monochrome,
+        glare=arguments.glare,
         seed=arguments.seed,
     )
     mismatch = Mismatch(arguments.panel_turn, arguments.recolor, arguments.missing, arguments.seed)

@@ -25,6 +25,8 @@ Progress = Callable[[int, int], None]
 
 # Full well of the sensor in electrons at exposed white: sets the shot noise.
 _FULL_WELL = 9000.0
+# Where stray light is brightest, of width and height, and over which share of the width it fades to a third.
+_GLARE_AT, _GLARE_REACH = (0.85, 0.15), 0.11
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,7 @@ class ClipSpec:
         earth: Earth behind the target, None = black sky.
         table: whether the target lies on a textured table, at rest, seen by a moving camera; the sun rests too.
         monochrome: a grey sensor.
+        glare: stray light of a sun at the upper right, what it is there in the unit of ``exposure``; 0 = none.
         jpeg_quality: 0 writes PNG instead.
         supersample: rays per pixel and side.
         gloss: multiplies the specular reflection.
@@ -77,6 +80,7 @@ class ClipSpec:
     earth: Earth | None = None
     table: bool = False
     monochrome: bool = False
+    glare: float = 0.0
     jpeg_quality: int = 92
     supersample: int = 2
     gloss: float = 1.0
@@ -86,7 +90,7 @@ class ClipSpec:
     def __post_init__(self) -> None:
         ranges = {"frames": (1, 100_000), "width": (16, 8192), "height": (16, 8192), "focal_px": (1, 1e6),
                   "supersample": (1, 8), "jpeg_quality": (0, 100), "drift": (0, 2), "exposure": (1e-6, 1e6),
-                  "noise": (0, 1), "psf_px": (0, 20), "star_count": (0, 1_000_000)}  # fmt: skip
+                  "noise": (0, 1), "psf_px": (0, 20), "star_count": (0, 1_000_000), "glare": (0, 10)}  # fmt: skip
         for name, (low, high) in ranges.items():
             value = getattr(self, name)
             if not low <= value <= high:
@@ -154,6 +158,8 @@ def render_clip(target: Target, spec: ClipSpec, poses: Float | None = None) -> I
         light = Light(to_sun, spec.ambient, to_earth, 0.05)
         radiance, coverage = renderer.render(T_cam_target, camera, light)
         image = radiance + sky.radiance(index, T_cam_target) * (1 - coverage[..., None])
+        if spec.glare > 0:
+            image = image + _glare(spec)
         mask = renderer.plain.render(T_cam_target, camera, color=False).mask
         yield SynthFrame(_expose(image, spec, index), mask, T_cam_target)
 
@@ -175,6 +181,14 @@ class _Backdrop:
         if self._earth is not None:
             return self._stars + self._earth.radiance(index * FRAME_STEP_NS * 1e-9)
         return self._stars
+
+
+def _glare(spec: ClipSpec) -> NDArray[np.float32]:
+    """(H, W, 1) stray light before exposure."""
+    x, y = np.arange(spec.width) - _GLARE_AT[0] * spec.width, np.arange(spec.height) - _GLARE_AT[1] * spec.height
+    distance = np.hypot(x[None, :], y[:, None])
+    glow = spec.glare / spec.exposure * np.exp(-distance / (_GLARE_REACH * spec.width))
+    return glow[..., None].astype(np.float32)
 
 
 def _expose(radiance: NDArray[np.float32], spec: ClipSpec, index: int) -> NDArray[np.uint8]:

@@ -150,6 +150,16 @@ def test_the_table_stays_with_the_target():
     np.testing.assert_allclose(colors[0], colors[1], atol=0.08)
 
 
+def test_stray_light_fades_from_the_sun_and_is_as_bright_as_asked():
+    target = build_target("probe")
+    spec = ClipSpec(frames=1, width=160, height=120, focal_px=250.0, glare=0.3, exposure=0.5, noise=0.0)
+    lit = next(render_clip(target, spec)).rgb.astype(int)
+    plain = next(render_clip(target, replace(spec, glare=0.0))).rgb.astype(int)
+    glow = (lit - plain)[18, 136:].max(axis=1)
+    assert abs(glow[0] - 149) < 12  # 0.3 in sRGB
+    assert (np.diff(glow) <= 0).all() and glow[-1] < 100
+
+
 def test_stars_are_few_and_repeatable():
     camera = SMALL.camera
     sky = stars(camera, 1, 30)
