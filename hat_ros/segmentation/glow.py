@@ -43,7 +43,7 @@ def without_glow(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
     scale = min(1.0, _SIDE_PX / max(h, w))
     size = (max(2, round(w * scale)), max(2, round(h * scale)))
     small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    known = (cv2.erode(_smooth_from_border(small), np.ones((3, 3), np.uint8))).astype(np.float32)
+    known = cv2.erode(_smooth_from_border(small), np.ones((3, 3), np.uint8)).astype(np.float32)
     glow = cv2.resize(_continued(small, known), (w, h), interpolation=cv2.INTER_LINEAR)
     return cv2.subtract(rgb, glow - _PEDESTAL, dtype=cv2.CV_8U)
 
