@@ -149,7 +149,7 @@ def render_clip(target: Target, spec: ClipSpec, poses: Float | None = None) -> I
     poses = trajectory(spec, target) if poses is None else poses
     camera = spec.camera
     renderer = SunlitRenderer(target, spec.supersample, spec.gloss)
-    sky = _Backdrop(spec, camera, target)
+    sky, glare = _Backdrop(spec, camera, target), _glare(spec)
     to_earth = None if spec.earth is None else np.asarray(spec.earth.nadir_cam, dtype=np.float64)
     to_sun = np.asarray(spec.to_sun_cam, dtype=np.float64)
     for index, T_cam_target in enumerate(poses):
@@ -158,8 +158,7 @@ def render_clip(target: Target, spec: ClipSpec, poses: Float | None = None) -> I
         light = Light(to_sun, spec.ambient, to_earth, 0.05)
         radiance, coverage = renderer.render(T_cam_target, camera, light)
         image = radiance + sky.radiance(index, T_cam_target) * (1 - coverage[..., None])
-        if spec.glare > 0:
-            image = image + _glare(spec)
+        image = image + glare
         mask = renderer.plain.render(T_cam_target, camera, color=False).mask
         yield SynthFrame(_expose(image, spec, index), mask, T_cam_target)
 
