@@ -15,7 +15,7 @@ from hat_ros.refinement.covariance import outline_floor, outline_misfit_px, pose
 from hat_ros.refinement.mask_field import MaskField, Overlap
 from hat_ros.refinement.refiner import WITH_MASK, WITHOUT_MASK, Fit, PoseFitter
 from hat_ros.refinement.sunlight import LightField, SunMatcher
-from hat_ros.refinement.view import TargetViewer, View
+from hat_ros.refinement.view import TargetViewer, View, contour_lines
 from hat_ros.target import Target
 from hat_ros.types import Detection, Frame, Refined, RotationPrior
 
@@ -28,8 +28,10 @@ _SHADOW_SHARE = 0.05
 # sun is looked for as well where the mask shows so much beside the silhouette (with what is black on black, as a share
 # of the silhouette), and not little of what it misses is black.
 _SMALL_SHARE, _BLACK_SHARE = 0.03, 0.2
-# A sunlit contour is a stub, which agrees with anything, where silhouette and mask disagree by so many pixels along it.
+# A sunlit contour is a stub, which agrees with anything, where silhouette and mask disagree by so many pixels along it;
+# where they disagree by so many times that before it is refined, refining does not help.
 _STUB_MISFIT_PX = 5.0
+_HOPELESS_FACTOR = 2.0
 # From a good prediction the fine round alone arrives: this share of the contour agrees, and nothing moved further.
 _ENOUGH_SUPPORT = 0.7
 _SMALL_MOVE_PX = 2.0
@@ -116,7 +118,7 @@ class FusedPoseRefiner:
         at_start = task.image.areas(task.view)
         in_shadow = at_start is not None and _lies_in_shadow(at_start)
         if in_shadow:
-            sunlit = self._sunlit(task)
+            sunlit = self._sunlit(task, at_start)
             if sunlit is not None:
                 return sunlit
         fit = self._fine(task) or self._fit_all(task, task.view)
@@ -127,7 +129,7 @@ class FusedPoseRefiner:
         if in_shadow or refined is None or areas is None or not _looks_small(areas):
             return refined
         # A pose too small and far hides its own shadow.
-        sunlit = self._sunlit(task)
+        sunlit = self._sunlit(task, at_start)
         return sunlit if sunlit is not None and sunlit.quality > refined.quality else refined
 
     def reset(self) -> None:
@@ -151,12 +153,15 @@ class FusedPoseRefiner:
                 view = self._viewer.view(start, camera, self._config.render_px)
         return _Task(image, prior, start, view)
 
-    def _sunlit(self, task: _Task) -> Refined | None:
+    def _sunlit(self, task: _Task, at_start: Overlap) -> Refined | None:
         """Refined by the contour of what the sun shines on; None where that is hardly anything, or no sun is found."""
         sunlight = self._sun.match(task.view, task.image.light)
         if sunlight is None:
             return None
         lit = self._viewer.in_sunlight(task.view, sunlight.to_sun_cam)
+        outline_px = contour_lines(lit, self._config.max_points).length_px
+        if outline_misfit_px(at_start, outline_px) > _HOPELESS_FACTOR * _STUB_MISFIT_PX:
+            return None
         fit = self._fit_all(task, lit, sunlight.to_sun_cam)
         if fit is None:
             return None

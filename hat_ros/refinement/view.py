@@ -236,6 +236,11 @@ class ContourLines:
     points_m: NDArray[np.float64]
     lines: NDArray[np.float64]
 
+    @property
+    def length_px(self) -> float:
+        """Length of the contour, pixels of the image."""
+        return float(self.lines[:, 2].sum())
+
 
 def contour_lines(view: View, max_points: int) -> ContourLines:
     """Sample the contour of a view; where a sun is known, only what it shines on, since the rest cannot be seen."""

@@ -46,8 +46,8 @@ def with_dim_parts(measured: Sky, lit: Mask) -> Mask:
     count, piece = cv2.connectedComponents(dim | seen | lit[box], connectivity=8)
     hangs_on = np.bincount(piece[lit[box] > 0], minlength=count) > 0
     out = lit.copy()
-    # Single pixels have been judged before, and outlines trimmed.
-    out[box] |= dim & hangs_on[piece] & (1 - seen)
+    added = dim > seen  # single pixels have been judged before, and outlines trimmed
+    out[box][added] |= hangs_on[piece[added]]
     return out
 
 

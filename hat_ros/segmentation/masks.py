@@ -39,14 +39,15 @@ def border_contact(mask: Mask) -> float:
 
 def fill_holes(mask: Mask, max_share: float) -> Mask:
     """Fill enclosed holes smaller than a share of the mask's area: dark details, not gaps between parts."""
-    contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    if hierarchy is None or (hierarchy[0, :, 3] < 0).all():
+    contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    holes = np.flatnonzero(hierarchy[0, :, 3] >= 0) if hierarchy is not None else ()
+    if not len(holes):
         return mask
     out = mask.copy()
     limit = max_share * np.count_nonzero(mask)
-    for contour, node in zip(contours, hierarchy[0], strict=True):
-        if node[3] >= 0 and cv2.contourArea(contour) <= limit:
-            cv2.drawContours(out, [contour], -1, 1, -1)
+    for i in holes:
+        if cv2.contourArea(contours[i]) <= limit:
+            cv2.drawContours(out, [contours[i]], -1, 1, -1)
     return out
 
 

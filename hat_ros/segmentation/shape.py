@@ -53,7 +53,8 @@ class SilhouetteBank:
         radii = (np.arange(_RADII) + 0.5) * (_EXTENT / _RADII)
         self._weight = (radii / radii.sum() / _ANGLES).astype(np.float32)  # area of a polar cell
         views = np.stack(polar)
-        self._spectra = np.conj(np.fft.rfft(views, axis=-1) * self._weight[:, None]).astype(np.complex64)
+        spectra = np.conj(np.fft.rfft(views, axis=-1) * self._weight[:, None]).astype(np.complex64)
+        self._spectra = np.ascontiguousarray(spectra.transpose(2, 0, 1))  # frequency, view, radius
         self._areas = np.einsum("vra,r->v", views, self._weight)
 
     def overlap(self, mask: NDArray[np.bool_]) -> float:
@@ -73,14 +74,18 @@ class SilhouetteBank:
         return best
 
     def _overlap_at(self, polar: NDArray[np.float32], known: NDArray[np.float32] | None) -> float:
-        spectrum = np.fft.rfft(polar, axis=-1).astype(np.complex64)
-        inter = np.fft.irfft(np.einsum("vrf,rf->vf", self._spectra, spectrum), n=_ANGLES, axis=-1)
+        inter = self._correlate(polar)
         area = float(polar.sum(axis=1) @ self._weight)
         areas = self._areas[:, None]
         if known is not None:
-            spectrum = np.fft.rfft(known, axis=-1).astype(np.complex64)
-            areas = np.fft.irfft(np.einsum("vrf,rf->vf", self._spectra, spectrum), n=_ANGLES, axis=-1)
+            areas = self._correlate(known)
         return float((inter / np.maximum(areas + area - inter, 1e-9)).max())
+
+    def _correlate(self, polar: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Area (views, angles) that a polar image shares with every silhouette at every angle."""
+        spectrum = np.fft.rfft(polar, axis=-1).astype(np.complex64)
+        shared = np.matmul(self._spectra, spectrum.T[:, :, None])[:, :, 0]
+        return np.fft.irfft(shared.T, n=_ANGLES, axis=-1)
 
 
 def _looking_along(direction: NDArray[np.float64]) -> NDArray[np.float64]:
