@@ -72,6 +72,8 @@ _POOR_SCORE = -6.0
 _LIGHT_MATTERS = 14.0
 # With a healthy prior among the starts, fewer matches: they are there to contradict it, not to find the target.
 _TRACKED_DIVISOR = 2
+# Where light is going to tell, the shape matches that compete with it (on six dark clips none further down was right).
+_LIT_DIVISOR = 2
 # A lead in log-likelihood that ends the search; without one, so many times the usual shape matches are tried.
 _CLEAR_LEAD = 6.0
 _MORE_COARSE = 3
@@ -163,17 +165,20 @@ class TemplateHypotheses:
             n_coarse = n_usual
             aligned += self._align(self._coarse(compared, placements, frame, field, n_coarse), frame, scorer)
         selected = self._select(aligned, self._max_candidates)
-        scored = self._finish(selected, frame, scorer)
+        promising = selected[: self._max_candidates // _LIT_DIVISOR] if relies_on_light else selected
+        scored = self._finish(promising, frame, scorer)
         leader = max(scored, key=lambda pair: pair[1], default=None)
         if scorer.dark_around and (leader is None or not self._confirms(leader[0], prior)):
             # What lies in shadow is missing from the mask: compare what is bright.
             lit = self._align(starts + self._coarse_lit(frame, scorer), frame, scorer, in_sunlight=True)
             scored += self._finish(lit, frame, scorer)
-        elif not self._is_clear(scored, prior):
-            further = self._coarse(compared, placements, frame, field, _MORE_COARSE * n_usual, n_coarse)
-            aligned += self._align(further, frame, scorer)
-            more = self._select(aligned, 2 * self._max_candidates)
-            scored += self._finish([start for start in more if start not in selected], frame, scorer)
+        else:
+            scored += self._finish(selected[len(promising) :], frame, scorer)
+            if not self._is_clear(scored, prior):
+                further = self._coarse(compared, placements, frame, field, _MORE_COARSE * n_usual, n_coarse)
+                aligned += self._align(further, frame, scorer)
+                more = self._select(aligned, 2 * self._max_candidates)
+                scored += self._finish([start for start in more if start not in selected], frame, scorer)
         if not scored:
             return Candidates.none()
         scored.sort(key=lambda pair: -pair[1])
