@@ -87,6 +87,8 @@ def so3_right_jacobian_inverse(rotvec: Array) -> Array:
 def rotation_angle(R: Array) -> Array:
     """Smallest rotation angle in radians, in [0, pi]: (..., 3, 3) -> (...)."""
     q = quat_from_matrix(R)
+    if q.ndim == 1:
+        return 2.0 * np.arctan2(math.sqrt(q[:3] @ q[:3]), q[3])
     return 2.0 * np.arctan2(np.sqrt(np.einsum("...i,...i->...", q[..., :3], q[..., :3])), q[..., 3])
 
 

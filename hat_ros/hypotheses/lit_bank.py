@@ -128,7 +128,7 @@ class _OneView:
         """(side, side) encoded brightness, 0 to 1."""
         seen = self.seen
         to_sun = (to_sun_cam @ self._R).astype(np.float32)
-        cosine = self._viewer.sunlit(seen.points_m, seen.face_id, seen.directions, to_sun)
+        cosine = self._viewer.sunlit(seen.points_m, seen.normals, to_sun)
         image = np.zeros(self._shape[0] * self._shape[1], np.float32)
         image[seen.pixel] = self._albedo * brightness(cosine)
         return image.reshape(self._shape)

@@ -102,7 +102,7 @@ class SunMatcher:
         R, seen, albedo = view.T_cam_target[:3, :3], scene.seen, scene.seen.rgb.astype(np.float32)
         trial = self._trial(scene, R, self._suns, _TRIAL_PIXELS)
         promising = self._suns[np.argsort(trial, kind="stable")[:_N_SHADOWED]]
-        cosine = self._viewer.sunlit_surfels(seen, promising @ R.astype(np.float32))
+        cosine = (self._viewer.sunlit(seen.points_m, seen.normals, sun) for sun in promising @ R.astype(np.float32))
         distance = [_distance(c, albedo, scene.observed, scene.beside, self._encoded) for c in cosine]
         best = int(np.argmin(distance))
         return Sunlight(float(distance[best]), promising[best].astype(np.float64))

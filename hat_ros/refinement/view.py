@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +20,7 @@ from hat_ros.refinement.contour import (
     COL_WEIGHT,
     contour_table,
 )
+from hat_ros.refinement.hits import facing, hit_points, image_box, normals_towards
 from hat_ros.render.embree import RayCaster
 from hat_ros.render.outline import Hits, Outlined, Rays, cast_outlined
 from hat_ros.target import Target
@@ -68,17 +70,13 @@ class Surfels:
 
     Attributes:
         pixel: (M,) index of the ray that sees each.
-        face_id: (M,) face.
         points_m: (M, 3) position.
-        directions: (M, 3) of the ray.
         normals: (M, 3) unit, towards the camera.
         rgb: (M, 3) uint8 albedo, sRGB.
     """
 
     pixel: NDArray[np.intp]
-    face_id: NDArray[np.int32]
     points_m: NDArray[np.float32]
-    directions: NDArray[np.float32]
     normals: NDArray[np.float32]
     rgb: NDArray[np.uint8]
 
@@ -118,18 +116,19 @@ class TargetViewer:
         bounds = self.bounds(T_cam_target, camera)
         if bounds is None:
             return None
-        size = np.array([camera.width, camera.height])
-        beyond = _BEYOND_IMAGE * size.max()
-        low, high = np.clip(bounds[:2], -beyond, size + beyond), np.clip(bounds[2:], -beyond, size + beyond)
-        scale = (side_px - 2 * _CROP_MARGIN_PX) / max(float((high - low).max()), 1e-3)
+        beyond = _BEYOND_IMAGE * max(camera.width, camera.height)
+        x0, x1 = (min(max(x, -beyond), camera.width + beyond) for x in (bounds[0], bounds[2]))
+        y0, y1 = (min(max(y, -beyond), camera.height + beyond) for y in (bounds[1], bounds[3]))
+        scale = float((side_px - 2 * _CROP_MARGIN_PX) / max(x1 - x0, y1 - y0, 1e-3))
         if not 1e-3 < scale < 1e3:
             return None
-        origin = low - _CROP_MARGIN_PX / scale
-        width, height = np.ceil((high - origin) * scale).astype(int) + _CROP_MARGIN_PX
+        origin = np.array([x0, y0]) - _CROP_MARGIN_PX / scale
+        width = math.ceil((x1 - origin[0]) * scale) + _CROP_MARGIN_PX
+        height = math.ceil((y1 - origin[1]) * scale) + _CROP_MARGIN_PX
         K = camera.K.copy()
         K[:2, 2] -= origin
         K[:2] *= scale
-        crop = Camera(K, int(width + width % 2), int(height + height % 2))
+        crop = Camera(K, width + width % 2, height + height % 2)
         R, t = T_cam_target[:3, :3], T_cam_target[:3, 3]
         to_ray = np.ascontiguousarray((R.T @ np.linalg.inv(crop.K)).T)  # rays in the target frame: affine in the pixel
         seen = cast_outlined(self._caster.trace, crop.width, crop.height, to_ray, -t @ R)
@@ -147,11 +146,8 @@ class TargetViewer:
 
     def bounds(self, T_cam_target: NDArray[np.float64], camera: Camera) -> NDArray[np.float64] | None:
         """Image box (x0, y0, x1, y1) around the target, None when it is not in front of the camera."""
-        points = self._hull_m @ T_cam_target[:3, :3].T + T_cam_target[:3, 3]
-        if not np.isfinite(points).all() or points[:, 2].min() <= 1e-3 * self.target.bounding_radius_m:
-            return None
-        uv = camera.project(points)
-        return np.concatenate([uv.min(axis=0), uv.max(axis=0)])
+        R, t = np.ascontiguousarray(T_cam_target[:3, :3]), np.ascontiguousarray(T_cam_target[:3, 3])
+        return image_box(self._hull_m, R, t, camera.K, 1e-3 * self.target.bounding_radius_m)
 
     def surface(self, directions: NDArray[np.float64], origin_m: NDArray[np.float64]) -> Surfels:
         """What rays (N, 3) from one point see, in the target frame."""
@@ -168,58 +164,34 @@ class TargetViewer:
 
     def _surfels(self, rays: Rays, hits: Hits) -> Surfels:
         origins, directions = rays
-        at = np.flatnonzero(hits["primID"] >= 0)
+        at, points = hit_points(origins, directions, hits["primID"], hits["tfar"])
         face_id, u, v = hits["primID"][at], hits["u"][at], hits["v"][at]
-        directions = directions[at]
-        normals = self._normals[face_id]
-        normals[np.einsum("nk,nk->n", normals, directions) > 0] *= np.float32(-1)
         rgb = self.target.surface.sample(face_id, np.stack([1.0 - u - v, u, v], axis=-1), self.target.face_rgb)
-        return Surfels(at, face_id, origins[at] + directions * hits["tfar"][at, None], directions, normals, rgb)
+        return Surfels(at, points, normals_towards(directions[at], face_id, self._normals), rgb)
 
     def _sunlit_hits(self, rays: Rays, hits: Hits, to_sun: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Which of the rays (N,) hit something that the sun shines on."""
-        at = np.flatnonzero(hits["primID"] >= 0)
         origins, directions = rays
-        points = origins[at] + directions[at] * hits["tfar"][at, None]
+        at, points = hit_points(origins, directions, hits["primID"], hits["tfar"])
+        normals = normals_towards(directions[at], hits["primID"][at], self._normals)
         lit = np.zeros(len(directions), np.bool_)
-        lit[at] = self.sunlit(points, hits["primID"][at], directions[at], to_sun) > 0
+        lit[at] = self.sunlit(points, normals, to_sun) > 0
         return lit
 
     def sunlit(
-        self,
-        points_m: NDArray[np.float32],
-        face_id: NDArray[np.int32],
-        directions: NDArray[np.float32],
-        to_sun: NDArray[np.float32],
+        self, points_m: NDArray[np.float32], normals: NDArray[np.float32], to_sun: NDArray[np.float32]
     ) -> NDArray[np.float32]:
         """Cosine of the sun's incidence (N,) at points that the camera sees, 0 where the sun does not reach.
 
         Args:
             points_m: (N, 3) on the surface.
-            face_id: (N,) faces they lie on.
-            directions: (N, 3) from the camera to them, any length.
+            normals: (N, 3) unit, towards the camera.
             to_sun: (3,) unit; everything in the target frame.
         """
-        normals = self._normals[face_id]
-        cosine = normals @ to_sun
-        # The side that faces the camera is lit, however the file winds its faces.
-        seen = np.where(np.einsum("nk,nk->n", normals, directions) > 0, np.float32(-1), np.float32(1))
-        cosine *= seen
-        lit = np.flatnonzero(cosine > _GRAZING)
-        start = points_m[lit] + (seen[lit, None] * self._shadow_start_m) * normals[lit]
-        lit = lit[~self._caster.occluded(start, np.broadcast_to(to_sun, start.shape))]
+        at, cosine, start = facing(points_m, normals, to_sun, _GRAZING, self._shadow_start_m)
         out = np.zeros(len(points_m), np.float32)
-        out[lit] = cosine[lit]
-        return out
-
-    def sunlit_surfels(self, seen: Surfels, to_suns: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Cosine of the incidence (S, M) of several suns (S, 3), unit, target frame, on what is seen; 0 in shadow."""
-        out = np.maximum(to_suns @ seen.normals.T, np.float32(0))
-        sun, at = np.nonzero(out > _GRAZING)
-        start = (seen.points_m + self._shadow_start_m * seen.normals)[at]
-        dark = self._caster.occluded(start, to_suns[sun])
-        out[sun[dark], at[dark]] = 0
-        out[out <= _GRAZING] = 0
+        reached = ~self._caster.occluded(start, np.broadcast_to(to_sun, start.shape))
+        out[at[reached]] = cosine[reached]
         return out
 
 

@@ -6,7 +6,6 @@ from hat_ros import lie
 from hat_ros.refinement.mask_field import MaskField
 from hat_ros.refinement.sunlight import LightField, SunMatcher, brightness
 from hat_ros.refinement.view import TargetViewer, contour_lines
-from hat_ros.render.embree import pixel_rays
 from hat_ros.types import Frame
 
 SUNS = {"beside": (-1.0, 0.2, -0.3), "behind the camera": (0.2, -0.3, -1.0), "ahead": (0.7, 0.6, 0.3)}
@@ -98,19 +97,6 @@ def test_a_view_put_in_sunlight_is_the_view_cast_in_it(viewer):
     at_once = viewer.view(T, CAMERA, 96, sun)
     later = viewer.in_sunlight(viewer.view(T, CAMERA, 96), sun)
     np.testing.assert_array_equal(at_once.lit, later.lit)
-
-
-def test_many_suns_at_once_light_what_each_lights(viewer):
-    T = random_pose(np.random.default_rng(3), viewer.target)
-    R, t = T[:3, :3], T[:3, 3]
-    rays = pixel_rays(CAMERA, np.arange(0, CAMERA.width, 4), np.arange(0, CAMERA.height, 4)).reshape(-1, 3)
-    seen = viewer.surface(rays @ R, -t @ R)
-    suns = np.array(list(SUNS.values()), np.float32)
-    suns = (suns / np.linalg.norm(suns, axis=1, keepdims=True)) @ R.astype(np.float32)
-    together = viewer.sunlit_surfels(seen, suns)
-    for sun, cosine in zip(suns, together, strict=True):
-        alone = viewer.sunlit(seen.points_m, seen.face_id, seen.directions, sun)
-        np.testing.assert_allclose(cosine, alone, atol=1e-5)
 
 
 def test_brightness_grows_with_the_cosine():
