@@ -73,6 +73,7 @@ class RefinedFusion:
         self._output: tuple[Float, Motion] | None = None
         self._start_track()
         self._measured: deque[tuple[int, Float]] = deque(maxlen=_RATE_HISTORY)
+        self._just_measured = False
 
     def _start_track(self) -> None:
         """Nobody has spoken for or against the track yet, and nothing is known of its predictions."""
@@ -113,6 +114,7 @@ class RefinedFusion:
             self._measured.append((frame.stamp_ns, fused.measurement))
             if anchor is not None and motion.valid:
                 self.alignment.observe(fused.measurement, motion.T_slam_cam)
+        self._just_measured = fused.measurement is not None
         self.alignment.update(motion.epoch)
         self._output = None if fused.T_cam_target is None else (fused.T_cam_target, motion)
         return fused
@@ -228,7 +230,9 @@ class RefinedFusion:
         else:
             position = (output if at_rate is None else at_rate)[:3, 3]
         moved = lie.transform(step[:3, :3] @ output[:3, :3], position)
-        return [moved] if at_rate is None or self._same(moved, at_rate) else [moved, at_rate]
+        # A rate that no image has confirmed of late is no second opinion.
+        second = at_rate is not None and self._just_measured and not self._same(moved, at_rate)
+        return [moved, at_rate] if second else [moved]
 
     def _at_constant_rate(self, stamp_ns: int) -> Float | None:
         """The measured outputs continued; None with fewer than two."""
