@@ -52,6 +52,7 @@ class TexturedBackground:
         self._contrast = 0.0  # of the tracked outline, slowly following
         self._since_check = 0
         self._check_every = _CHECK_UNAIDED_FRAMES
+        self._unconfirmed = False  # the last glance found something else: a search is due
         self._vouched = False  # by the ground behind it, for the tracked mask
         self._found_anew = False  # the previous mask: the one before it tells nothing about its motion
         self._failures = 0
@@ -83,7 +84,7 @@ class TexturedBackground:
             if tracked is not None:
                 due = self._since_check >= (self._config.check_interval_frames if aided else self._check_every)
                 doubtful = self._since_check >= _CHECK_UNAIDED_FRAMES
-                due = due or (doubtful and overlap(tracked, moved(masks[1], *shift_xy)) < _STEADY)
+                due = due or self._unconfirmed or (doubtful and overlap(tracked, moved(masks[1], *shift_xy)) < _STEADY)
                 return self._cross_check(rgb, tracked, aided, silhouette) if due else tracked
         if trusted and silhouette is not None:
             found = self._search.around(rgb, silhouette)
@@ -230,11 +231,14 @@ class TexturedBackground:
         """Compare a tracked mask with what a search from nothing finds; keep the more plausible one.
 
         A mask held in place by a prediction is given up only for one that means something else; while a glance finds
-        the same, nothing more is searched. What a prediction speaks for, trusted or not, must be clearly beaten.
+        the same, nothing more is searched. A glance and a search take as long as several frames, so the search waits
+        for the next one. What a prediction speaks for, trusted or not, must be clearly beaten.
         """
         self._since_check = 0
-        if aided and self._search.confirms(tracked):
+        if aided and not self._unconfirmed:
+            self._unconfirmed = not self._search.confirms(tracked)
             return tracked
+        self._unconfirmed = False
         found = self._search.find(rgb, touched_sides(tracked))
         agreement = 0.0 if found is None else overlap(found.mask, tracked)
         longer = min(2 * self._check_every, self._config.check_interval_frames)
