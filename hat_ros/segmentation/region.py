@@ -113,13 +113,19 @@ def _note_ground(labels: Mask, seen: GroundEvidence, some: Mask, near: Mask) -> 
     return target
 
 
-def cut_from_nothing(rgb: NDArray[np.uint8], open_side: str | None = None, near: Mask | None = None) -> Mask | None:
+def cut_from_nothing(
+    rgb: NDArray[np.uint8],
+    open_side: str | None = None,
+    near: Mask | None = None,
+    iterations: int = _COLD_ITERATIONS,
+) -> Mask | None:
     """Cut with the image border as the only example of background.
 
     Args:
         rgb: (h, w, 3) reduced image.
         open_side: top, bottom, left or right: there the target may reach the border.
         near: 0/1 mask of what is known of the target; the side opens only beside it.
+        iterations: of GrabCut; the first takes as long as the other two.
     """
     labels = np.full(rgb.shape[:2], cv2.GC_PR_FGD, np.uint8)
     ring = _ring_px(rgb)
@@ -139,7 +145,7 @@ def cut_from_nothing(rgb: NDArray[np.uint8], open_side: str | None = None, near:
             "right": np.s_[rows, -depth:],
         }[open_side]
         labels[part] = cv2.GC_PR_FGD
-    cut = graph_cut(rgb, labels, ColorModels(), _COLD_ITERATIONS)
+    cut = graph_cut(rgb, labels, ColorModels(), iterations)
     return None if cut is None else tidy(cut, None)
 
 
@@ -159,8 +165,11 @@ def _ring_px(image: NDArray[np.uint8]) -> int:
     return max(2, round(_RING_SHARE * max(image.shape[:2])))
 
 
-def cut_from_motion(rgb: NDArray[np.uint8], moving: Mask) -> Mask | None:
-    """Cut around what moved, (h, w) 0/1: parts of the target, rarely all of it, and nothing far from it."""
+def cut_from_motion(rgb: NDArray[np.uint8], moving: Mask, iterations: int = _COLD_ITERATIONS) -> Mask | None:
+    """Cut around what moved, (h, w) 0/1: parts of the target, rarely all of it, and nothing far from it.
+
+    ``iterations`` as for :func:`cut_from_nothing`.
+    """
     points = cv2.findNonZero(moving)
     hull = cv2.fillConvexPoly(np.zeros_like(moving), cv2.convexHull(points), 1)
     x, y, w, h = cv2.boundingRect(points)
@@ -168,7 +177,7 @@ def cut_from_motion(rgb: NDArray[np.uint8], moving: Mask) -> Mask | None:
     labels = np.full(moving.shape, cv2.GC_BGD, np.uint8)
     labels[max(0, y - reach) : y + h + reach, max(0, x - reach) : x + w + reach] = cv2.GC_PR_BGD
     labels[hull > 0] = cv2.GC_PR_FGD
-    cut = graph_cut(rgb, labels, ColorModels(), _COLD_ITERATIONS)
+    cut = graph_cut(rgb, labels, ColorModels(), iterations)
     return None if cut is None else tidy(cut, moving)
 
 

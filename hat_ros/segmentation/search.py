@@ -22,6 +22,7 @@ from hat_ros.segmentation.shape import SilhouetteBank
 MIN_CONTRAST = 8.0  # 8-bit colour step across the outline below which there is no outline
 OPEN_BETTER = 0.012  # plausibility by which a cut that takes a liberty must beat the one that does not
 AGREEMENT = 0.8  # overlap of two independent masks that mean the same target
+_GLANCE_ITERATIONS = 1  # of a cut that is only to agree so far
 # A target contains most of what moves against the background, and hardly any texture that moves with it. Every
 # hundredth short of that costs a hundredth of shape overlap; ...
 _MIN_FOUND = 0.6
@@ -128,9 +129,9 @@ class Search:
         kind = kinds[self._turn // 2 % len(kinds)]
         self._turn += 1
         if motion is not None:
-            cut = region.cut_from_motion(self._newest.window.rgb, motion.moving)
+            cut = region.cut_from_motion(self._newest.window.rgb, motion.moving, _GLANCE_ITERATIONS)
         else:
-            cut = region.cut_from_nothing(self._newest.window.rgb, kind, small)
+            cut = region.cut_from_nothing(self._newest.window.rgb, kind, small, _GLANCE_ITERATIONS)
         return cut is not None and overlap(cut, small) >= AGREEMENT
 
     def find(self, rgb: NDArray[np.uint8], open_sides: tuple[str, ...]) -> Found | None:
