@@ -14,13 +14,13 @@ that did not compete would lose to chance.
 Unless the best candidate is where a healthy track expects it, more is tried. A mask that no view fits well is matched
 as part of a silhouette, unless light is going to tell and there is a prior. Before a black sky the mask holds what is
 lit, which need not be the whole target: matches of brightness (``lit_bank``) compete as well, and of those only the
-sunlit part of the contour is compared with the mask. Before anything else more shape matches are tried where no
-candidate leads clearly.
+sunlit part of the contour is compared with the mask. Stray light around the mask is taken off before, where the sky is
+black otherwise. Before anything else more shape matches are tried where no candidate leads clearly.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -49,6 +49,7 @@ from hat_ros.refinement.refiner import PoseFitter, Schedule
 from hat_ros.refinement.sunlight import SunMatcher
 from hat_ros.refinement.view import TargetViewer
 from hat_ros.render import create_renderer
+from hat_ros.segmentation.glow import look_into_space
 from hat_ros.target import Target
 from hat_ros.types import Camera, Candidates, Detection, Frame, PosePrior
 
@@ -125,6 +126,7 @@ class TemplateHypotheses:
             raise ConfigError(f"hypotheses.template.n_angles must be even, found {options.n_angles}")
         self._options = options
         self._max_candidates = config.hypotheses.max_candidates
+        self._sky_border_share = config.segmentation.classical.sky_border_share
         self._target = target
         self._viewer = TargetViewer(target)
         self._fitter = PoseFitter(self._viewer, options.render_px, _CONTOUR_POINTS)
@@ -143,6 +145,11 @@ class TemplateHypotheses:
             return Candidates.none()
         field = MaskField(mask)
         scorer = Scorer(self._viewer, frame, field, self._options.render_px)
+        if not scorer.dark_around:
+            space = look_into_space(frame.rgb, self._sky_border_share)
+            if space is not None and space.rgb is not frame.rgb:  # what is not the target's light says nothing about it
+                frame = replace(frame, rgb=space.rgb)
+                scorer = Scorer(self._viewer, frame, field, self._options.render_px)
         starts = []
         n_coarse = n_usual = self._options.n_coarse * (_UNAIDED_FACTOR if prior is None else 1)
         if prior is not None:

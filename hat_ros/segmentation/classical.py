@@ -11,21 +11,18 @@ itself alive.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hat_ros.config import HatConfig
 from hat_ros.render.embree import EmbreeRenderer
-from hat_ros.segmentation.glow import fades_out, without_glow
+from hat_ros.segmentation.glow import look_into_space
 from hat_ros.segmentation.lit import LitBody
 from hat_ros.segmentation.masks import Mask, enlarge, overlap
 from hat_ros.segmentation.shape import SilhouetteBank
-from hat_ros.segmentation.sky import Sky, dark_border_share, lit_regions, measure_sky
 from hat_ros.segmentation.textured import TexturedBackground
 from hat_ros.target import Target
 from hat_ros.types import Detection, Frame, PosePrior
 
-_STRAY_SHARE = 0.85  # of the dark border that a black sky has is left at least where stray light falls on it
-_LEAP = 0.6  # share of that overlap below which a mask is not believed ...
+_LEAP = 0.6  # share of the last overlap with a sure silhouette below which a mask is not believed ...
 _MAX_LEAPS = 4  # ... for so many frames
 _MAX_GROWTH = 1.6  # of what is lit, over the silhouette
 
@@ -59,38 +56,17 @@ class ClassicalSegmenter:
         silhouette = self._silhouette(frame, prior)
         supported = prior is not None and prior.supported
         certain = prior is not None and prior.healthy  # what is dark is added only where the basin is beyond doubt
-        measured, regions = self._before_black_sky(frame.rgb)
+        space = look_into_space(frame.rgb, self._config.sky_border_share)
         mask = None
-        if regions:
-            mask = self._lit.find(measured, regions, self._masks[1], silhouette if certain else None)
+        if space is not None and space.regions:
+            mask = self._lit.find(space.sky, space.regions, self._masks[1], silhouette if certain else None)
         lit = mask is not None
-        if mask is None and (regions or measured is None):
+        if mask is None and (space is None or space.regions):
             mask = self._textured.find(frame.rgb, self._masks, silhouette, supported)
         if mask is not None and (not mask.any() or (certain and self._leaps(mask, silhouette, lit))):
             mask = None
         self._masks = (self._masks[1], mask)
         return None if mask is None else Detection(mask.astype(bool))
-
-    def _before_black_sky(self, rgb: NDArray[np.uint8]) -> tuple[Sky | None, list[Mask]]:
-        """The sky and the bright regions before it, once more without stray light where that is in the way.
-
-        No sky where the border is not mostly black, and no regions where nothing stands out.
-        """
-        required = self._config.sky_border_share
-        dark = dark_border_share(rgb)
-        if dark < _STRAY_SHARE * required:
-            return None, []
-        measured = measure_sky(rgb)
-        black = measured.border_share >= required
-        regions = lit_regions(measured) if black else []
-        if black and (not regions or not fades_out(measured, regions[0])):
-            return measured, regions
-        cleared = measure_sky(without_glow(rgb))
-        if cleared.border_share >= required:
-            sharp = lit_regions(cleared)
-            if not sharp or not fades_out(cleared, sharp[0]):
-                return cleared, sharp
-        return (measured, regions) if black else (None, [])
 
     def _leaps(self, mask: Mask, silhouette: Mask | None, lit: bool) -> bool:
         """Whether a mask suddenly leaves a silhouette beyond doubt that the masks so far have filled.

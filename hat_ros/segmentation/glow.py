@@ -6,13 +6,16 @@ brightness; behind what is not, the glow goes on smoothly. A threshold would tak
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from hat_ros.segmentation.masks import Mask, touches_border
-from hat_ros.segmentation.sky import Sky
+from hat_ros.segmentation.sky import Sky, dark_border_share, lit_regions, measure_sky
 
+_STRAY_SHARE = 0.85  # of the dark border that a black sky has is left at least where stray light falls on it
 _SIDE_PX = 160  # longer side of the image on which the glow is followed
 # Largest relative step between neighbours there, and the grey levels added to both so that noise stays below it. A glow
 # that fades to a third within a ninth of the image takes steps of this size; outlines take several times as large ones.
@@ -23,6 +26,45 @@ _PEDESTAL = 8  # grey level of what is left of the sky, so that its noise shows 
 # Less where the image border cuts the region, as it does most glows: the rest may be the outline of a target in it.
 _RING_PX = (3, 4)
 _MAX_SOFT_SHARE, _MAX_SOFT_SHARE_CUT = 0.45, 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Space:
+    """What is seen before a black sky.
+
+    Attributes:
+        rgb: (H, W, 3) uint8 image, without its stray light where that was in the way.
+        sky: brightness of the sky in it.
+        regions: what is lit in it, see :func:`hat_ros.segmentation.sky.lit_regions`.
+    """
+
+    rgb: NDArray[np.uint8]
+    sky: Sky
+    regions: list[Mask]
+
+
+def look_into_space(rgb: NDArray[np.uint8], border_share: float) -> Space | None:
+    """The sky in an (H, W, 3) uint8 image and what is lit before it; None unless so much of the border is black sky.
+
+    Stray light is taken off first where it hides that sky, or where the brightest region fades out instead of ending;
+    unless something fades out even then.
+    """
+    if dark_border_share(rgb) < _STRAY_SHARE * border_share:
+        return None
+    space = _measured(rgb, border_share)
+    if space is not None and not _is_hazy(space):
+        return space
+    cleared = _measured(without_glow(rgb), border_share)
+    return space if cleared is None or _is_hazy(cleared) else cleared
+
+
+def _measured(rgb: NDArray[np.uint8], border_share: float) -> Space | None:
+    sky = measure_sky(rgb)
+    return Space(rgb, sky, lit_regions(sky)) if sky.border_share >= border_share else None
+
+
+def _is_hazy(space: Space) -> bool:
+    return bool(space.regions) and fades_out(space.sky, space.regions[0])
 
 
 def fades_out(measured: Sky, region: Mask) -> bool:

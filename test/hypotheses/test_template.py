@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -50,6 +52,22 @@ def test_a_view_with_half_its_silhouette_in_shadow_is_found_again(backend, targe
     turn, shift = pose_errors(candidates.T_cam_target, T_true)
     assert turn[0] < 8
     assert shift[0] < 0.05
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_stray_light_around_it_does_not_hide_that_a_target_is_half_in_shadow(backend, target, seed):
+    T_true = random_pose(np.random.default_rng(seed), target)
+    frame, mask = sunlit_picture(target, T_true, (-1.0, 0.4, -0.1))
+    lit = mask & (frame.rgb.max(axis=2) > 16)
+    x, y = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
+    u, v = CAMERA.project(T_true[:3, 3])
+    glow = 110.0 * np.exp(-np.hypot(x - u, y - v) / 60.0)
+    assert np.median(glow[cv2.dilate(mask.astype(np.uint8), np.ones((25, 25))) > mask]) > 32
+    glaring = replace(frame, rgb=np.minimum(frame.rgb + glow[..., None], 255).astype(np.uint8))
+    candidates = backend.generate(glaring, Detection(lit), None)
+    turn, shift = pose_errors(candidates.T_cam_target, T_true)
+    assert turn[0] < 8
+    assert shift[0] < 0.08
 
 
 @pytest.mark.parametrize("seed", range(4))
