@@ -15,7 +15,8 @@ Unless the best candidate is where a healthy track expects it, more is tried. A 
 as part of a silhouette, unless light is going to tell and there is a prior. Before a black sky the mask holds what is
 lit, which need not be the whole target: matches of brightness (``lit_bank``) compete as well, and of those only the
 sunlit part of the contour is compared with the mask. Stray light around the mask is taken off before, where the sky is
-black otherwise. Before anything else more shape matches are tried where no candidate leads clearly.
+black otherwise. Before anything else more shape matches are tried where no candidate leads clearly. At last the best
+candidate competes with the orientations that have nearly its silhouette (``symmetry``), if they were not tried.
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ from hat_ros.hypotheses.matching import (
     whole_placement,
 )
 from hat_ros.hypotheses.scoring import Scorer, light_score, log_score, shape_score
+from hat_ros.hypotheses.symmetry import load_or_find_symmetries, turned
 from hat_ros.refinement.mask_field import MaskField
 from hat_ros.refinement.refiner import PoseFitter, Schedule
 from hat_ros.refinement.sunlight import SunMatcher
@@ -80,6 +82,8 @@ _CLEAR_LEAD = 6.0
 _MORE_COARSE = 3
 # Candidates of different searches closer than this are the same.
 _SAME_DEG = 8.0
+# One this close to a pose has ended where a start at that pose would end.
+_TRIED_DEG = 2.0
 _FIRST = Schedule((0, 0, 0, 0), (1, 1, 1, 1), (6, 4, 3, 2))
 _LAST = Schedule((0, 4, 3.5, 3), (1, 2, 1.5, 1.5), (3, 2, 1.5, 1.5))
 
@@ -135,6 +139,7 @@ class TemplateHypotheses:
         renderer = create_renderer("embree", target)
         self._bank = load_or_build(target, renderer, options.n_views, options.n_angles)
         self._body_bank = load_or_build(target, renderer, options.n_views, options.n_angles, thin_parts=False)
+        self._near_symmetries = load_or_find_symmetries(target)
         for bank in (self._lit_bank, self._bank, self._body_bank):  # a bank just built is not typed like one from disk
             rehearse(bank)
 
@@ -188,6 +193,7 @@ class TemplateHypotheses:
                 scored += self._finish([start for start in more if start not in selected], frame, scorer)
         if not scored:
             return Candidates.none()
+        scored += self._finish(self._align(self._counterparts(scored), frame, scorer), frame, scorer)
         scored.sort(key=lambda pair: -pair[1])
         T, score = np.stack([T for T, _ in scored]), np.array([score for _, score in scored])
         keep = distinct(T[:, :3, :3], self._max_candidates, np.radians(_SAME_DEG))
@@ -271,6 +277,13 @@ class TemplateHypotheses:
         ordered = sorted(aligned, key=lambda a: -a.score)
         R = np.stack([a.T_cam_target[:3, :3] for a in ordered])
         return [ordered[i] for i in distinct(R, n_best, np.radians(self._options.separation_deg))]
+
+    def _counterparts(self, scored: list[tuple[NDArray[np.float64], float]]) -> list[NDArray[np.float64]]:
+        """Poses that look like the best candidate and have not been tried: nobody else may have been near them."""
+        leader, _ = max(scored, key=lambda pair: pair[1])
+        others = [turned(leader, turn, self._target.center_m) for turn in self._near_symmetries]
+        known = np.stack([T[:3, :3] for T, _ in scored])
+        return [T for T in others if lie.angle_between(known, T[:3, :3]).min() > np.radians(_TRIED_DEG)]
 
     def _confirms(self, T_cam_target: NDArray[np.float64], prior: PosePrior | None) -> bool:
         """Whether a candidate that leads is the healthy prior's: then nothing else is looked for."""

@@ -104,6 +104,7 @@ class TexturedBackground:
     def _adopt(self, found: Found) -> Mask:
         """Go on from what a search found."""
         self._since_check = 0
+        self._unconfirmed = False
         self._found_anew = True
         self._models = found.models
         self._contrast = found.contrast
