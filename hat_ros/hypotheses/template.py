@@ -84,6 +84,8 @@ _MORE_COARSE = 3
 _SAME_DEG = 8.0
 # One this close to a pose has ended where a start at that pose would end.
 _TRIED_DEG = 2.0
+# Orientations of nearly one silhouette are told apart by details: rendered so many times finer.
+_FINER = 3
 _FIRST = Schedule((0, 0, 0, 0), (1, 1, 1, 1), (6, 4, 3, 2))
 _LAST = Schedule((0, 4, 3.5, 3), (1, 2, 1.5, 1.5), (3, 2, 1.5, 1.5))
 
@@ -134,6 +136,7 @@ class TemplateHypotheses:
         self._target = target
         self._viewer = TargetViewer(target)
         self._fitter = PoseFitter(self._viewer, options.render_px, _CONTOUR_POINTS)
+        self._finer_fitter = PoseFitter(self._viewer, _FINER * options.render_px, _CONTOUR_POINTS)
         self._sun = SunMatcher(self._viewer)
         self._lit_bank = load_or_build_lit(self._viewer, options.n_angles)
         renderer = create_renderer("embree", target)
@@ -193,7 +196,10 @@ class TemplateHypotheses:
                 scored += self._finish([start for start in more if start not in selected], frame, scorer)
         if not scored:
             return Candidates.none()
-        scored += self._finish(self._align(self._counterparts(scored), frame, scorer), frame, scorer)
+        if len(self._near_symmetries):
+            scored += self._finish(self._align(self._counterparts(scored), frame, scorer), frame, scorer)
+            if not scorer.dark_around:
+                scored = self._closer_look(scored, frame, scorer)
         scored.sort(key=lambda pair: -pair[1])
         T, score = np.stack([T for T, _ in scored]), np.array([score for _, score in scored])
         keep = distinct(T[:, :3, :3], self._max_candidates, np.radians(_SAME_DEG))
@@ -285,6 +291,26 @@ class TemplateHypotheses:
         known = np.stack([T[:3, :3] for T, _ in scored])
         return [T for T in others if lie.angle_between(known, T[:3, :3]).min() > np.radians(_TRIED_DEG)]
 
+    def _closer_look(
+        self, scored: list[tuple[NDArray[np.float64], float]], frame: Frame, scorer: Scorer
+    ) -> list[tuple[NDArray[np.float64], float]]:
+        """The same, the best candidate and those that look like it compared once more by their details."""
+        leader, _ = max(scored, key=lambda pair: pair[1])
+        alike = [leader] + [turned(leader, turn, self._target.center_m) for turn in self._near_symmetries]
+        basin = np.stack([T[:3, :3] for T in alike])
+        rest, best = [], {}
+        for T, score in scored:
+            apart_rad = lie.angle_between(basin, T[:3, :3])
+            nearest = int(np.argmin(apart_rad))
+            if apart_rad[nearest] > np.radians(_SAME_DEG):
+                rest.append((T, score))
+            elif nearest not in best or score > best[nearest][1]:
+                best[nearest] = (T, score)
+        starts = [Aligned(T, None, score) for T, score in best.values()]
+        finer = Scorer(self._viewer, frame, scorer.field, _FINER * self._options.render_px)
+        again = self._finish(starts, frame, finer, self._finer_fitter)
+        return rest + again if len(again) == len(starts) else scored
+
     def _confirms(self, T_cam_target: NDArray[np.float64], prior: PosePrior | None) -> bool:
         """Whether a candidate that leads is the healthy prior's: then nothing else is looked for."""
         if prior is None or not prior.healthy:
@@ -301,14 +327,17 @@ class TemplateHypotheses:
         rivals = np.array([score for _, score in scored])[apart_rad > np.radians(self._options.separation_deg)]
         return bool(best - rivals.max(initial=-np.inf) >= _CLEAR_LEAD) or self._confirms(leader, prior)
 
-    def _finish(self, starts: list[Aligned], frame: Frame, scorer: Scorer) -> list[tuple[NDArray[np.float64], float]]:
+    def _finish(
+        self, starts: list[Aligned], frame: Frame, scorer: Scorer, fitter: PoseFitter | None = None
+    ) -> list[tuple[NDArray[np.float64], float]]:
         """Refine on mask and image, and score: poses and log-likelihoods.
 
         Sunlight is fitted to those that it could still make the best; the others are given the worst of these fits.
         """
+        fitter = fitter or self._fitter
         poses, views, scores = [], [], []
         for start in starts:
-            fit = self._fitter.fit(
+            fit = fitter.fit(
                 start.T_cam_target, frame.camera, frame.rgb, scorer.field, (_LAST,), to_sun_cam=start.to_sun_cam
             )
             view = None if fit is None else scorer.view(fit, start.to_sun_cam)
