@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 import trimesh
-from shape_scene import picture, pose_errors, random_pose, spacecraft
+from shape_scene import CAMERA, picture, pose_errors, random_pose, spacecraft
 
 from hat_ros import lie
 from hat_ros.config import HatConfig
 from hat_ros.hypotheses.symmetry import load_or_find_symmetries, near_symmetries, turned
 from hat_ros.hypotheses.template import TemplateHypotheses
 from hat_ros.target import target_from_scene
-from hat_ros.types import Detection, PosePrior
+from hat_ros.types import Camera, Detection, PosePrior
 
 HALF_TURN_Z = np.diag([-1.0, -1.0, 1.0])
 
@@ -89,3 +89,25 @@ def test_the_counterpart_of_a_prior_competes_even_where_the_search_finds_neither
     turn, _ = pose_errors(backend.generate(frame, Detection(mask), prior).T_cam_target, T_true)
     assert turn.min() < 3
     assert turn.max() > 170
+
+
+def test_a_thin_antenna_tells_two_orientations_clearly_apart(tmp_path, monkeypatch):
+    """At the resolution that tells basins apart it is lost between the rays, or several times too thick."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    body = trimesh.creation.box((0.5, 0.6, 1.6))
+    wings = trimesh.creation.box((3.0, 0.04, 0.5), transform=lie.transform(np.eye(3), [0, 0, 0.5]))
+    rod = trimesh.creation.cylinder(0.012, 0.7, transform=lie.transform(np.eye(3), [0.2, 0.25, -1.15]))
+    target = target_from_scene(trimesh.Scene([body, wings, rod]), "rod")
+    camera = Camera(CAMERA.K * np.array([[2.0, 1, 2], [1, 2.0, 2], [1, 1, 1]]), 2 * CAMERA.width, 2 * CAMERA.height)
+    backend = TemplateHypotheses(HatConfig(), target)
+    leads = []
+    for seed in (0, 7, 9, 10):  # views in which nothing hides it
+        T_true = random_pose(np.random.default_rng(seed), target)
+        frame, mask = picture(target, T_true, camera, background=200)
+        mirrored = lie.row_from_matrix(turned(T_true, HALF_TURN_Z, target.center_m))
+        prior = PosePrior(0, mirrored, mirrored, healthy=False, supported=True)
+        candidates = backend.generate(frame, Detection(mask), prior)
+        turn, _ = pose_errors(candidates.T_cam_target, T_true)
+        leads.append(candidates.log_score[turn < 5].max() - candidates.log_score[turn > 175].max())
+    assert min(leads) > 0
+    assert np.mean(leads) > 3.8
