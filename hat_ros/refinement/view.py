@@ -28,6 +28,7 @@ from hat_ros.types import Camera
 
 # Margin of the rendered crop around the target, in crop pixels: the contour needs background on both sides.
 _CROP_MARGIN_PX = 4
+_ROUNDING_PX = 1e-6
 # What lies further outside the image than this share of its longer side is not rendered.
 _BEYOND_IMAGE = 0.05
 # Shadow rays start this far off the surface, in bounding radii; light this close to grazing shows nothing.
@@ -123,8 +124,9 @@ class TargetViewer:
         if not 1e-3 < scale < 1e3:
             return None
         origin = np.array([x0, y0]) - _CROP_MARGIN_PX / scale
-        width = math.ceil((x1 - origin[0]) * scale) + _CROP_MARGIN_PX
-        height = math.ceil((y1 - origin[1]) * scale) + _CROP_MARGIN_PX
+        # The longer side is a whole number up to rounding, which must not decide.
+        width = math.ceil((x1 - origin[0]) * scale - _ROUNDING_PX) + _CROP_MARGIN_PX
+        height = math.ceil((y1 - origin[1]) * scale - _ROUNDING_PX) + _CROP_MARGIN_PX
         K = camera.K.copy()
         K[:2, 2] -= origin
         K[:2] *= scale
