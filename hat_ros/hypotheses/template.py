@@ -16,7 +16,8 @@ as part of a silhouette, unless light is going to tell and there is a prior. Bef
 lit, which need not be the whole target: matches of brightness (``lit_bank``) compete as well, and of those only the
 sunlit part of the contour is compared with the mask. Stray light around the mask is taken off before, where the sky is
 black otherwise. Before anything else more shape matches are tried where no candidate leads clearly. At last the best
-candidate competes with the orientations that have nearly its silhouette (``symmetry``), if they were not tried.
+candidate competes with the orientations that have nearly its silhouette (``symmetry``), tried or not, and before
+anything but a black sky these are compared once more by their details.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ _POOR_SCORE = -6.0
 _LIGHT_MATTERS = 14.0
 # With a healthy prior among the starts, fewer matches: they are there to contradict it, not to find the target.
 _TRACKED_DIVISOR = 2
-# Where light is going to tell, the shape matches that compete with it (on six dark clips none further down was right).
+# Where light is going to tell, so many times fewer shape matches compete: on six dark clips no right one was below.
 _LIT_DIVISOR = 2
 # A lead in log-likelihood that ends the search; without one, so many times the usual shape matches are tried.
 _CLEAR_LEAD = 6.0
@@ -286,18 +287,20 @@ class TemplateHypotheses:
 
     def _counterparts(self, scored: list[tuple[NDArray[np.float64], float]]) -> list[NDArray[np.float64]]:
         """Poses that look like the best candidate and have not been tried: nobody else may have been near them."""
-        leader, _ = max(scored, key=lambda pair: pair[1])
-        others = [turned(leader, turn, self._target.center_m) for turn in self._near_symmetries]
         known = np.stack([T[:3, :3] for T, _ in scored])
+        _, *others = self._alike(scored)
         return [T for T in others if lie.angle_between(known, T[:3, :3]).min() > np.radians(_TRIED_DEG)]
+
+    def _alike(self, scored: list[tuple[NDArray[np.float64], float]]) -> list[NDArray[np.float64]]:
+        """The best candidate, and the poses that have nearly its silhouette: (4, 4) each."""
+        leader, _ = max(scored, key=lambda pair: pair[1])
+        return [leader, *(turned(leader, turn, self._target.center_m) for turn in self._near_symmetries)]
 
     def _closer_look(
         self, scored: list[tuple[NDArray[np.float64], float]], frame: Frame, scorer: Scorer
     ) -> list[tuple[NDArray[np.float64], float]]:
         """The same, the best candidate and those that look like it compared once more by their details."""
-        leader, _ = max(scored, key=lambda pair: pair[1])
-        alike = [leader] + [turned(leader, turn, self._target.center_m) for turn in self._near_symmetries]
-        basin = np.stack([T[:3, :3] for T in alike])
+        basin = np.stack([T[:3, :3] for T in self._alike(scored)])
         rest, best = [], {}
         for T, score in scored:
             apart_rad = lie.angle_between(basin, T[:3, :3])
