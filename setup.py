@@ -43,7 +43,7 @@ setup(
     entry_points={
         "console_scripts": [
             "hat = hat_ros.cli:main",
-            *(f"{name}_node = hat_ros.nodes.{name}_node:main" for name in NODES),
+            *(f"{name}_node = hat_ros.ros.{name}_node:main" for name in NODES),
         ]
     },
 )

@@ -12,7 +12,7 @@ from typing import Protocol
 
 from hat_ros.config import HatConfig
 from hat_ros.errors import ConfigError, MissingDependencyError
-from hat_ros.target import Target
+from hat_ros.target.model import Target
 from hat_ros.types import Candidates, Detection, Frame, Motion, PosePrior
 
 
@@ -65,13 +65,13 @@ BACKENDS: dict[str, dict[str, str]] = {
         "gigapose": "hat_ros.hypotheses.gigapose:GigaPoseHypotheses",
     },
     "slam": {
-        "feature": "hat_ros.slam.feature:FeatureSlam",
-        "droid": "hat_ros.slam.droid:DroidSlam",
+        "feature": "hat_ros.motion.feature:FeatureSlam",
+        "droid": "hat_ros.motion.droid:DroidSlam",
     },
 }
 
 # slam backend -> motion of a whole clip in hindsight, for the offline reference; others keep what they said.
-OFFLINE_MOTIONS: dict[str, str] = {"droid": "hat_ros.slam.droid:offline_motions"}
+OFFLINE_MOTIONS: dict[str, str] = {"droid": "hat_ros.motion.droid:offline_motions"}
 
 OfflineMotions = Callable[[HatConfig, Sequence[tuple[Frame, Detection | None]]], list[Motion]]
 

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 from hat_ros.config import HatConfig
 from hat_ros.core.fusion import FusionStage
-from hat_ros.core.prior import PriorBuffer
 from hat_ros.core.selector import SelectorStage
 from hat_ros.hypotheses.stage import HypothesisStage
+from hat_ros.motion.stage import MotionStage
 from hat_ros.refinement import create_refiner
 from hat_ros.segmentation.stage import SegmentationStage
-from hat_ros.slam.stage import MotionStage
-from hat_ros.target import Target
+from hat_ros.target.model import Target
+from hat_ros.tracking.prior import PriorBuffer
 from hat_ros.types import Candidates, Detection, Estimate, Frame, Motion, Selection
 
 

@@ -14,8 +14,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from hat_ros import lie
 from hat_ros.errors import CandidateError, FrameError
+from hat_ros.geometry import lie
 
 Float = NDArray[np.float64]
 

@@ -14,9 +14,9 @@ import sys
 from numba.core.dispatcher import Dispatcher
 
 from hat_ros.config import load_config
-from hat_ros.datasets.backdrop import Earth
-from hat_ros.datasets.models import build_target
-from hat_ros.datasets.synth import ClipSpec, render_clip
+from hat_ros.bench.synth.backdrop import Earth
+from hat_ros.bench.synth.models import build_target
+from hat_ros.bench.synth.clips import ClipSpec, render_clip
 from hat_ros.tracker import HatTracker
 from hat_ros.types import Frame
 

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from hat_ros import lie
 from hat_ros.errors import CandidateError, FrameError
+from hat_ros.geometry import lie
 from hat_ros.types import Camera, Candidates, Detection, Estimate, Frame, Motion, Selection, TrackState
 
 K = np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])

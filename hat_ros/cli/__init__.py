@@ -10,7 +10,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from hat_ros.cli import analyse, campaign, data, run, system
+from hat_ros.cli import analyse, bench, data, run, system
 from hat_ros.errors import HatError
 
 EXIT_INTERRUPTED = 130
@@ -33,7 +33,7 @@ def build_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for group in (run, data, analyse, campaign, system):
+    for group in (run, data, analyse, bench, system):
         group.add_commands(commands)
     return parser
 

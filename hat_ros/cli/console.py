@@ -96,7 +96,7 @@ def figure_lines(figures: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 @contextmanager
-def campaign_progress(total: int) -> Iterator[Callable[[Any], None]]:
+def matrix_progress(total: int) -> Iterator[Callable[[Any], None]]:
     """A line per finished run and a bar over all of them; yields what to call with each outcome."""
     console = Console(stderr=True)
     columns = (TextColumn("runs"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

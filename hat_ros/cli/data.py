@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from hat_ros.cli.options import FORMATS, Commands, natural, positive
 
 if TYPE_CHECKING:
-    from hat_ros.datasets.suite import Clip
+    from hat_ros.bench.synth.suite import Clip
 
 
 def add_commands(commands: Commands) -> None:
@@ -60,8 +60,8 @@ def _add_import(commands: Commands) -> None:
 
 
 def _import(arguments: argparse.Namespace) -> int:
+    from hat_ros.bench.datasets.importer import import_dataset
     from hat_ros.cli.console import count_progress
-    from hat_ros.datasets.importer import import_dataset
 
     with count_progress(arguments.quiet) as watch:
         bags = import_dataset(
@@ -138,9 +138,9 @@ def _add_synth(commands: Commands) -> None:
 
 
 def _synth(arguments: argparse.Namespace) -> int:
+    from hat_ros.bench.synth import suite
+    from hat_ros.bench.synth.models import model_names
     from hat_ros.cli.console import count_progress
-    from hat_ros.datasets import suite
-    from hat_ros.datasets.models import model_names
     from hat_ros.errors import UsageError
 
     what = arguments.what
@@ -164,11 +164,11 @@ def _synth(arguments: argparse.Namespace) -> int:
 
 def _filmed(arguments: argparse.Namespace) -> Clip:
     """The clip that the options describe."""
-    from hat_ros.datasets.backdrop import Earth
-    from hat_ros.datasets.mismatch import Mismatch
-    from hat_ros.datasets.models import model_names
-    from hat_ros.datasets.suite import CLIPS, Clip
-    from hat_ros.datasets.synth import ClipSpec
+    from hat_ros.bench.synth.backdrop import Earth
+    from hat_ros.bench.synth.clips import ClipSpec
+    from hat_ros.bench.synth.mismatch import Mismatch
+    from hat_ros.bench.synth.models import model_names
+    from hat_ros.bench.synth.suite import CLIPS, Clip
     from hat_ros.errors import UsageError
 
     if arguments.what not in model_names() and not Path(arguments.what).is_file():

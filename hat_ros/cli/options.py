@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from hat_ros.bench.source import SourceSpec
     from hat_ros.config import HatConfig
-    from hat_ros.source import SourceSpec
 
 FORMATS = ("sequence", "spark", "shirt", "swisscube", "bop", "ycbv")
 
@@ -67,8 +67,8 @@ def add_dataset(parser: argparse.ArgumentParser) -> None:
 
 def spec_of(arguments: argparse.Namespace) -> SourceSpec:
     """The recording that a command's ``recording``, :func:`add_dataset` and ``--sequence`` name."""
+    from hat_ros.bench.source import SourceSpec
     from hat_ros.errors import UsageError
-    from hat_ros.source import SourceSpec
 
     if bool(arguments.dataset) != bool(arguments.sequence):
         raise UsageError("--dataset and --sequence belong together: name the layout and one of its sequences")

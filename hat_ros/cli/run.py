@@ -68,8 +68,8 @@ def _add_credits(parser: argparse.ArgumentParser, default: str) -> None:
 
 
 def _replay(arguments: argparse.Namespace) -> int:
+    from hat_ros.bench.runs import ReplayOptions, replay_bag
     from hat_ros.cli.console import print_figures, state_progress
-    from hat_ros.runner import ReplayOptions, replay_bag
 
     options = ReplayOptions(
         graph=arguments.graph,
@@ -119,8 +119,8 @@ def _add_track(commands: Commands) -> None:
 
 def _track(arguments: argparse.Namespace) -> int:
     limit_threads(arguments.threads)
+    from hat_ros.bench.runs import TrackOptions, track
     from hat_ros.cli.console import print_figures, state_progress
-    from hat_ros.runner import TrackOptions, track
 
     spec = spec_of(arguments)
     options = TrackOptions(
@@ -155,7 +155,7 @@ def _add_temporal(commands: Commands) -> None:
 
 
 def _temporal(arguments: argparse.Namespace) -> int:
-    from hat_ros.temporal import load_observations, run_offline, run_temporal, save_result
+    from hat_ros.bench.temporal import load_observations, run_offline, run_temporal, save_result
 
     run = run_offline if arguments.offline else run_temporal
     config = config_of(arguments)

@@ -85,7 +85,7 @@ def _doctor(_: argparse.Namespace) -> int:
     from rich.table import Table
     from rich.text import Text
 
-    from hat_ros.doctor import run_checks
+    from hat_ros.app.doctor import run_checks
 
     findings = run_checks()
     table = Table(title="hat doctor")
@@ -119,9 +119,9 @@ def _add_profile(commands: Commands) -> None:
 
 def _profile(arguments: argparse.Namespace) -> int:
     limit_threads(arguments.threads)
+    from hat_ros.bench.profiler import profile
     from hat_ros.cli.console import state_progress
-    from hat_ros.profiler import profile
-    from hat_ros.results import write_json
+    from hat_ros.io.results import write_json
 
     source = spec_of(arguments).open()
     with state_progress("profiling", arguments.quiet) as watch:

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hat_ros import lie
 from hat_ros.config import AlignmentConfig
 from hat_ros.core.joint_history import JointHistory, relative_rotvecs
+from hat_ros.geometry import lie
 from hat_ros.types import Alignment, Float
 
 # A regression slope at or below zero is no similarity: the cost then falls towards scale zero, which this stands for.

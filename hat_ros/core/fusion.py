@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from hat_ros import lie
 from hat_ros.config import HatConfig
-from hat_ros.core.causal import AreaConfidence, CausalFusion, Fused
-from hat_ros.core.confidence import BasinConfidence
-from hat_ros.core.refined import RefinedFusion
-from hat_ros.core.refiner import Refiner
+from hat_ros.core.published_fusion import AreaConfidence, CausalFusion, Fused
 from hat_ros.core.selector import box_area_px, rotation_increment
 from hat_ros.core.uncertainty import KeyframeSpread, ResidualCovariance
+from hat_ros.geometry import lie
+from hat_ros.tracking.confidence import BasinConfidence
+from hat_ros.tracking.image_fusion import RefinedFusion
+from hat_ros.tracking.refiner import Refiner
 from hat_ros.types import Detection, Estimate, Float, Frame, Motion, Selection, TrackState
 
 _NO_POSE = np.full(7, np.nan)

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from hat_ros import lie
 from hat_ros.errors import CandidateError
+from hat_ros.geometry import lie
 from hat_ros.types import Candidates, Float
 
 MIN_RANGE_M = 1e-3

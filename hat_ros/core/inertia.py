@@ -13,7 +13,7 @@ in the next frame, and a quarter in the one after (tried: the error doubles at v
 
 from __future__ import annotations
 
-from hat_ros import lie
+from hat_ros.geometry import lie
 from hat_ros.types import Float
 
 

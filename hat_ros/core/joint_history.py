@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hat_ros import lie
+from hat_ros.geometry import lie
 from hat_ros.types import Float
 
 _MEAN_TOLERANCE_RAD = 1e-14

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hat_ros import lie
+from hat_ros.geometry import lie
 from hat_ros.types import Float
 
 _MAX_STEPS = 100

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hat_ros import lie
+from hat_ros.geometry import lie
 from hat_ros.types import Float, Selection
 
 # Effective number of residuals that the running means remember.

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from hat_ros.cache import cached_arrays
 from hat_ros.refinement.contour import COL_WEIGHT, contour_table
-from hat_ros.render import Renderer
-from hat_ros.target import Target
+from hat_ros.target.model import Target
+from hat_ros.target.rendering import Renderer
 from hat_ros.types import Camera
 
 # Raised whenever the content of a bank changes its meaning: older cache files are then not found.

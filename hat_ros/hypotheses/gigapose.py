@@ -17,8 +17,8 @@ from hat_ros.hypotheses.picopose_templates import CROP_PX, TEMPLATE_K, TEMPLATE_
 from hat_ros.nets import gigapose as gp
 from hat_ros.nets import picopose as pp
 from hat_ros.nets.checkpoint import load_into, load_state
-from hat_ros.render.network_views import NetworkViewRenderer
-from hat_ros.target import Target
+from hat_ros.target.model import Target
+from hat_ros.target.network_views import NetworkViewRenderer
 from hat_ros.types import Candidates, Detection, Frame, PosePrior
 
 LOG = logging.getLogger(__name__)

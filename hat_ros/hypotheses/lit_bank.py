@@ -27,7 +27,7 @@ from hat_ros.hypotheses.bank import (
 from hat_ros.refinement.contour import COL_NU, COL_NV, COL_U, COL_V, COL_WEIGHT, contour_table
 from hat_ros.refinement.sunlight import brightness
 from hat_ros.refinement.view import Surfels, TargetViewer
-from hat_ros.render.embree import pixel_rays
+from hat_ros.target.embree import pixel_rays
 from hat_ros.types import Camera
 
 _FORMAT = 2

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from hat_ros import lie
+from hat_ros.geometry import lie
 from hat_ros.hypotheses.bank import (
     MAX_RADIUS,
     N_RINGS,

@@ -19,15 +19,15 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
-from hat_ros import lie
 from hat_ros.cache import cached_arrays
 from hat_ros.config import HatConfig
+from hat_ros.geometry import lie
 from hat_ros.nets import megapose as mp
 from hat_ros.nets.checkpoint import load_into, load_state
 from hat_ros.nets.runtime import Runtime
 from hat_ros.nets.so3_grid import so3_grid
-from hat_ros.render.network_views import NetworkViewRenderer
-from hat_ros.target import Target
+from hat_ros.target.model import Target
+from hat_ros.target.network_views import NetworkViewRenderer
 from hat_ros.types import Camera, Candidates, Detection, Frame, PosePrior
 
 LOG = logging.getLogger(__name__)

@@ -15,9 +15,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from hat_ros import lie
 from hat_ros.cache import cached_arrays
 from hat_ros.config import HatConfig, PicoPoseConfig
+from hat_ros.geometry import lie
 from hat_ros.hypotheses.picopose_templates import (
     CROP_PX,
     POINT_CELLS,
@@ -29,7 +29,7 @@ from hat_ros.hypotheses.picopose_templates import (
 from hat_ros.nets import picopose as pp
 from hat_ros.nets.checkpoint import load_into, load_state
 from hat_ros.nets.runtime import Runtime
-from hat_ros.target import Target
+from hat_ros.target.model import Target
 from hat_ros.types import Candidates, Detection, Frame, PosePrior
 
 LOG = logging.getLogger(__name__)

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hat_ros import lie
-from hat_ros.render.embree import EmbreeRenderer, pixel_rays
-from hat_ros.render.icosphere import icosphere, look_at_origin
-from hat_ros.render.network_views import NetworkViewRenderer
-from hat_ros.target import Target
+from hat_ros.geometry import lie
+from hat_ros.target.embree import EmbreeRenderer, pixel_rays
+from hat_ros.target.model import Target
+from hat_ros.target.network_views import NetworkViewRenderer
+from hat_ros.target.sphere import icosphere, look_at_origin
 from hat_ros.types import Camera
 
 LOG = logging.getLogger(__name__)

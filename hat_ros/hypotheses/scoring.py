@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hat_ros.refinement.mask_field import VISIBLE_LEVEL, MaskField
-from hat_ros.refinement.refiner import Fit
+from hat_ros.refinement.pose_fitter import Fit
 from hat_ros.refinement.sunlight import LightField
 from hat_ros.refinement.view import TargetViewer, View
 from hat_ros.types import Frame

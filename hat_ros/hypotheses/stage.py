@@ -9,7 +9,7 @@ from hat_ros.core.cadence import Cadence
 from hat_ros.core.guard import guard_candidates
 from hat_ros.core.keyframes import KeyframeSchedule
 from hat_ros.stages import create_backend
-from hat_ros.target import Target
+from hat_ros.target.model import Target
 from hat_ros.types import Candidates, Detection, Float, Frame, PosePrior
 
 # Between successive detections of one thing little changes: boxes overlap by this, intersection over union, and

@@ -28,9 +28,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hat_ros import lie
 from hat_ros.config import HatConfig
 from hat_ros.errors import ConfigError
+from hat_ros.geometry import lie
 from hat_ros.hypotheses.bank import ViewBank, load_or_build, without_thin_parts
 from hat_ros.hypotheses.box import silhouette_in_box
 from hat_ros.hypotheses.lit_bank import load_or_build_lit
@@ -46,14 +46,14 @@ from hat_ros.hypotheses.matching import (
     whole_placement,
 )
 from hat_ros.hypotheses.scoring import Scorer, light_score, log_score, shape_score
-from hat_ros.hypotheses.symmetry import load_or_find_symmetries, turned
 from hat_ros.refinement.mask_field import MaskField
-from hat_ros.refinement.refiner import PoseFitter, Schedule
+from hat_ros.refinement.pose_fitter import PoseFitter, Schedule
 from hat_ros.refinement.sunlight import SunMatcher
 from hat_ros.refinement.view import TargetViewer
-from hat_ros.render import create_renderer
 from hat_ros.segmentation.glow import look_into_space
-from hat_ros.target import Target
+from hat_ros.target.model import Target
+from hat_ros.target.rendering import create_renderer
+from hat_ros.target.symmetry import load_or_find_symmetries, turned
 from hat_ros.types import Camera, Candidates, Detection, Frame, PosePrior
 
 _VIEW_COUNTS = (162, 642, 2562)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hat_ros.refinement.mask_field import Overlap
-from hat_ros.refinement.refiner import Fit
+from hat_ros.refinement.pose_fitter import Fit
 
 # Systematic error of an outline: a threshold at half level, a glow or a fillet each move it by part of a pixel.
 OUTLINE_SIGMA_PX = 0.25

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from hat_ros.linear import cholesky_in_place, cholesky_solve, product, rotation
+from hat_ros.geometry.linear import cholesky_in_place, cholesky_solve, product, rotation
 
 Array = NDArray[np.float64]
 

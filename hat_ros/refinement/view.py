@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from hat_ros import lie
+from hat_ros.geometry import lie
 from hat_ros.refinement.contour import (
     COL_INSIDE,
     COL_NU,
@@ -21,9 +21,9 @@ from hat_ros.refinement.contour import (
     contour_table,
 )
 from hat_ros.refinement.hits import facing, hit_points, image_box, normals_towards
-from hat_ros.render.embree import RayCaster
-from hat_ros.render.outline import Hits, Outlined, Rays, cast_outlined
-from hat_ros.target import Target
+from hat_ros.target.embree import RayCaster
+from hat_ros.target.model import Target
+from hat_ros.target.outline import Hits, Outlined, Rays, cast_outlined
 from hat_ros.types import Camera
 
 # Margin of the rendered crop around the target, in crop pixels: the contour needs background on both sides.

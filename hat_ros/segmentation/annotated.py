@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hat_ros.config import HatConfig
-from hat_ros.target import Target
+from hat_ros.target.model import Target
 from hat_ros.types import Detection, Frame, PosePrior
 
 SILHOUETTE = 255

@@ -13,13 +13,13 @@ from __future__ import annotations
 import numpy as np
 
 from hat_ros.config import HatConfig
-from hat_ros.render.embree import EmbreeRenderer
 from hat_ros.segmentation.glow import look_into_space
 from hat_ros.segmentation.lit import LitBody
 from hat_ros.segmentation.masks import Mask, enlarge, overlap
 from hat_ros.segmentation.shape import SilhouetteBank
 from hat_ros.segmentation.textured import TexturedBackground
-from hat_ros.target import Target
+from hat_ros.target.embree import EmbreeRenderer
+from hat_ros.target.model import Target
 from hat_ros.types import Detection, Frame, PosePrior
 
 _LEAP = 0.6  # share of the last overlap with a sure silhouette below which a mask is not believed ...

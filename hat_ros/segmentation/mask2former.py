@@ -21,7 +21,7 @@ from hat_ros.config import HatConfig, Mask2FormerConfig
 from hat_ros.errors import WeightsError
 from hat_ros.nets.checkpoint import find
 from hat_ros.nets.runtime import Runtime
-from hat_ros.target import Target
+from hat_ros.target.model import Target
 from hat_ros.types import Detection, Frame, PosePrior
 
 # An instance that fills more of the image than this is its background.

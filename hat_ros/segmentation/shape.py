@@ -13,9 +13,9 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from hat_ros import lie
-from hat_ros.render import Renderer
-from hat_ros.target import Target
+from hat_ros.geometry import lie
+from hat_ros.target.model import Target
+from hat_ros.target.rendering import Renderer
 from hat_ros.types import Camera
 
 _SIDE_PX = 96  # side of the rendered silhouettes

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from hat_ros.config import HatConfig
 from hat_ros.errors import FrameError
 from hat_ros.stages import create_backend
-from hat_ros.target import Target
+from hat_ros.target.model import Target
 from hat_ros.types import Detection, Frame, PosePrior
 
 # A frame whose brightest pixel is this dark (8-bit) shows nothing: lens cap, eclipse, lost exposure.

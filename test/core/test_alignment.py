@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from hat_ros import lie
 from hat_ros.config import AlignmentConfig
 from hat_ros.core.alignment import SlamAlignment, umeyama
 from hat_ros.core.joint_history import JointHistory, relative_rotvecs, rotation_mean
+from hat_ros.geometry import lie
 
 
 def _planted(seed, n=40, noise_deg=0.0, noise_m=0.0, scale=2.5, turn_deg=1.5, outliers=0):

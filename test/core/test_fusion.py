@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from temporal_scene import make_scene, preset
 
-from hat_ros import lie
 from hat_ros.core.fusion import FusionStage
 from hat_ros.core.selector import SelectorStage
 from hat_ros.core.uncertainty import ResidualCovariance
+from hat_ros.geometry import lie
 from hat_ros.types import Camera, Candidates, Frame, Motion, Selection, TrackState
 
 

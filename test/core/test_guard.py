@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from hat_ros import lie
 from hat_ros.core.guard import candidates_from_recording, guard_candidates
 from hat_ros.errors import CandidateError
+from hat_ros.geometry import lie
 
 
 def _poses(depths):

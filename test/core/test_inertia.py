@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from temporal_scene import make_scene, preset, rotation_error_deg
 
-from hat_ros import lie
+from hat_ros.bench.temporal import run_temporal
 from hat_ros.core.inertia import InertialPrior
-from hat_ros.temporal import run_temporal
+from hat_ros.geometry import lie
 
 STEP = lie.transform(lie.so3_exp(np.array([0.02, -0.03, 0.01])), np.zeros(3))
 

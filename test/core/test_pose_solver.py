@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from hat_ros import lie
 from hat_ros.core.pose_solver import PoseProblem, solve_pose
+from hat_ros.geometry import lie
 
 
 def _problem(seed, apart_deg, apart_m, anchor_weight=1.0, relative_weight=0.1, delta=0.3):

@@ -5,9 +5,9 @@ from itertools import product
 import numpy as np
 import pytest
 
-from hat_ros import lie
 from hat_ros.config import SelectorConfig
 from hat_ros.core.selector import RunningGate, SelectorStage, motion_penalty, rotation_increment, scaled_score
+from hat_ros.geometry import lie
 from hat_ros.types import Candidates, Motion
 
 FREE = SelectorConfig(warmup_keyframes=1)

@@ -3,11 +3,11 @@ import pytest
 import trimesh
 from shape_scene import spacecraft
 
-from hat_ros import lie
 from hat_ros.cache import cache_folder
+from hat_ros.geometry import lie
 from hat_ros.hypotheses import bank
-from hat_ros.render import create_renderer
-from hat_ros.target import target_from_scene
+from hat_ros.target.model import target_from_scene
+from hat_ros.target.rendering import create_renderer
 
 
 @pytest.fixture(scope="module")

@@ -6,16 +6,16 @@ import torch
 import trimesh
 from rule_weights import save_rule_weights
 
-from hat_ros import lie
 from hat_ros.config import config_from_dict
 from hat_ros.errors import WeightsError
+from hat_ros.geometry import lie
 from hat_ros.hypotheses import gigapose, megapose, picopose
 from hat_ros.hypotheses.picopose_templates import SquareCrop, render_templates, square_crop, template_poses
 from hat_ros.nets import gigapose as gp
 from hat_ros.nets import megapose as mp
 from hat_ros.nets.runtime import Runtime
 from hat_ros.stages import create_backend
-from hat_ros.target import target_from_scene
+from hat_ros.target.model import target_from_scene
 from hat_ros.types import Camera, Detection, Frame
 
 CAMERA = Camera(np.array([[300.0, 0, 79.5], [0, 300.0, 59.5], [0, 0, 1]]), 160, 120)

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from shape_scene import CAMERA, pose_errors, random_pose, spacecraft
 
-from hat_ros import lie
+from hat_ros.geometry import lie
 from hat_ros.hypotheses import bank
 from hat_ros.hypotheses.matching import cut_placements, distinct, match_shape, whole_placement
-from hat_ros.render import create_renderer
+from hat_ros.target.rendering import create_renderer
 
 
 @pytest.fixture(scope="module")

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from shape_scene import CAMERA, picture, random_pose, spacecraft
 
-from hat_ros import lie
+from hat_ros.geometry import lie
 from hat_ros.hypotheses.scoring import Evidence, Scorer, log_score, shape_score
 from hat_ros.refinement.mask_field import MaskField
-from hat_ros.refinement.refiner import PoseFitter, Schedule
+from hat_ros.refinement.pose_fitter import PoseFitter, Schedule
 from hat_ros.refinement.view import TargetViewer
 
 _MEASURE = Schedule((4,), (1.5,), (1.5,))

@@ -5,16 +5,16 @@ import numpy as np
 import pytest
 from shape_scene import CAMERA, picture, pose_errors, random_pose, spacecraft, sunlit_picture
 
-from hat_ros import lie
 from hat_ros.config import HatConfig, HypothesesConfig, TemplateConfig
 from hat_ros.errors import ConfigError
+from hat_ros.geometry import lie
 from hat_ros.hypotheses import template
 from hat_ros.hypotheses.matching import match_shape
 from hat_ros.hypotheses.stage import HypothesisStage
 from hat_ros.hypotheses.template import TemplateHypotheses
 from hat_ros.refinement.mask_field import MaskField
 from hat_ros.refinement.view import TargetViewer, contour_lines
-from hat_ros.render import create_renderer
+from hat_ros.target.rendering import create_renderer
 from hat_ros.types import Camera, Detection, Frame, PosePrior
 
 

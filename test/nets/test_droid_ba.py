@@ -7,7 +7,7 @@ import pytest
 import torch
 from weight_rule import rule_filled
 
-from hat_ros import lie
+from hat_ros.geometry import lie
 from hat_ros.nets import droid_geometry as geometry
 from hat_ros.nets.droid import DroidNet, upsample_disparity
 from hat_ros.nets.droid_ba import (

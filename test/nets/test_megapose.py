@@ -9,8 +9,8 @@ import pytest
 import torch
 from weight_rule import rule_filled, rule_state
 
-from hat_ros import lie
 from hat_ros.errors import WeightsError
+from hat_ros.geometry import lie
 from hat_ros.nets import megapose as mp
 
 DATA = Path(__file__).parents[1] / "data"

@@ -1,6 +1,6 @@
 import numpy as np
 
-from hat_ros import lie
+from hat_ros.geometry import lie
 from hat_ros.refinement.covariance import OUTLINE_SIGMA_PX, USUAL_MISFIT_PX, outline_floor, outline_misfit_px
 from hat_ros.refinement.mask_field import Overlap
 

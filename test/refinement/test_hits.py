@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hat_ros import lie
+from hat_ros.geometry import lie
 from hat_ros.refinement.hits import facing, hit_points, image_box, normals_towards
 from hat_ros.types import Camera
 

@@ -4,7 +4,7 @@ from shape_scene import CAMERA, random_pose, spacecraft
 
 from hat_ros.refinement.mask_field import MaskField
 from hat_ros.refinement.view import TargetViewer
-from hat_ros.render import create_renderer
+from hat_ros.target.rendering import create_renderer
 
 BLACK = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
 

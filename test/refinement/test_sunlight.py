@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from shape_scene import CAMERA, random_pose, spacecraft, sunlit_picture
 
-from hat_ros import lie
+from hat_ros.geometry import lie
 from hat_ros.refinement.mask_field import MaskField
 from hat_ros.refinement.sunlight import LightField, SunMatcher, brightness
 from hat_ros.refinement.view import TargetViewer, contour_lines

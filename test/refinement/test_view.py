@@ -3,12 +3,12 @@ import numpy as np
 import pytest
 from shape_scene import CAMERA, random_pose, spacecraft
 
-from hat_ros import lie
+from hat_ros.geometry import lie
 from hat_ros.refinement.mask_field import MaskField
-from hat_ros.refinement.refiner import PoseFitter
+from hat_ros.refinement.pose_fitter import PoseFitter
 from hat_ros.refinement.view import TargetViewer
-from hat_ros.render import create_renderer
-from hat_ros.render.outline import spread_grid
+from hat_ros.target.outline import spread_grid
+from hat_ros.target.rendering import create_renderer
 from hat_ros.types import Camera
 
 BLACK = np.zeros((CAMERA.height, CAMERA.width), np.uint8)

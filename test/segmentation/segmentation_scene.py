@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import trimesh
 
-from hat_ros import lie
-from hat_ros.render import create_renderer
-from hat_ros.target import target_from_scene
+from hat_ros.geometry import lie
+from hat_ros.target.model import target_from_scene
+from hat_ros.target.rendering import create_renderer
 from hat_ros.types import Camera, Frame, PosePrior
 
 WIDTH, HEIGHT = 320, 240

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 from segmentation_scene import HEIGHT, WIDTH, frame, overlap, prior
 
-from hat_ros import lie
 from hat_ros.config import HatConfig
+from hat_ros.geometry import lie
 from hat_ros.segmentation.ground import GroundEvidence, GroundMemory
 from hat_ros.segmentation.search import Search
 from hat_ros.segmentation.stage import SegmentationStage

@@ -4,13 +4,13 @@ import pytest
 from segmentation_scene import HEIGHT, WIDTH, frame, overlap
 
 from hat_ros.config import HatConfig
-from hat_ros.render.embree import EmbreeRenderer
 from hat_ros.segmentation.ground import GroundMemory
 from hat_ros.segmentation.masks import Window
 from hat_ros.segmentation.region import tidy
 from hat_ros.segmentation.search import Search
 from hat_ros.segmentation.shape import SilhouetteBank
 from hat_ros.segmentation.stage import SegmentationStage
+from hat_ros.target.embree import EmbreeRenderer
 
 BOX = np.s_[90:150, 130:200]  # where the body stands
 LENGTH_PX = 70.0

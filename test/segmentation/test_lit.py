@@ -4,11 +4,11 @@ import pytest
 import trimesh
 
 from hat_ros.config import ClassicalConfig
-from hat_ros.render.embree import EmbreeRenderer
 from hat_ros.segmentation.lit import LitBody
 from hat_ros.segmentation.shape import SilhouetteBank
 from hat_ros.segmentation.sky import lit_regions, measure_sky
-from hat_ros.target import target_from_scene
+from hat_ros.target.embree import EmbreeRenderer
+from hat_ros.target.model import target_from_scene
 
 
 def body_of(*boxes):

@@ -4,9 +4,9 @@ import pytest
 from segmentation_scene import HEIGHT, WIDTH
 
 from hat_ros.config import HatConfig
-from hat_ros.render.embree import EmbreeRenderer
 from hat_ros.segmentation.search import Search
 from hat_ros.segmentation.shape import SilhouetteBank
+from hat_ros.target.embree import EmbreeRenderer
 
 
 @pytest.fixture

@@ -2,8 +2,8 @@ import cv2
 import numpy as np
 import pytest
 
-from hat_ros.render import create_renderer
 from hat_ros.segmentation.shape import SilhouetteBank
+from hat_ros.target.rendering import create_renderer
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 import trimesh
 
-from hat_ros import lie
 from hat_ros.config import DroidConfig, HatConfig, SlamConfig
-from hat_ros.render.embree import EmbreeRenderer
-from hat_ros.target import target_from_scene
+from hat_ros.geometry import lie
+from hat_ros.target.embree import EmbreeRenderer
+from hat_ros.target.model import target_from_scene
 from hat_ros.types import Camera, Detection, Frame
 
 STRIDE = 8

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from rosbags.rosbag2 import Reader
 
-from hat_ros.bag import TYPESTORE, BagReader
 from hat_ros.config import HatConfig
-from hat_ros.nodes import topics, wire
-from hat_ros.result_bag import ResultBagWriter
-from hat_ros.target import load_target
+from hat_ros.io import messages, topics
+from hat_ros.io.bag import TYPESTORE, BagReader
+from hat_ros.io.result_bag import ResultBagWriter
+from hat_ros.target.model import load_target
 from hat_ros.tracker import HatTracker
 
 N_FRAMES = 14
@@ -53,21 +53,21 @@ def said(bag: Path) -> dict[str, list[tuple[int, str, bytes]]]:
             message = TYPESTORE.deserialize_cdr(data, connection.msgtype)
             payload = _payload(connection.topic, message)
             if payload is not None:
-                out[connection.topic].append((wire.stamp_of(message), message.header.frame_id, payload))
+                out[connection.topic].append((messages.stamp_of(message), message.header.frame_id, payload))
     return {topic: sorted(items) for topic, items in out.items()}
 
 
 def _payload(topic: str, message) -> bytes | None:
     if topic in TABLES:
-        return wire.read_table(message, TABLES[topic]).tobytes()
+        return messages.read_table(message, TABLES[topic]).tobytes()
     if topic in POSES:
-        return wire.pose_row_from(message.pose).tobytes()
+        return messages.pose_row_from(message.pose).tobytes()
     if topic == topics.TARGET_POSE_WITH_COVARIANCE:
-        return wire.pose_row_from(message.pose.pose).tobytes() + np.asarray(message.pose.covariance).tobytes()
+        return messages.pose_row_from(message.pose.pose).tobytes() + np.asarray(message.pose.covariance).tobytes()
     if topic == topics.HYPOTHESES:
-        return b"".join(wire.pose_row_from(pose).tobytes() for pose in message.poses)
+        return b"".join(messages.pose_row_from(pose).tobytes() for pose in message.poses)
     if topic == topics.SLAM_ODOMETRY:
-        return wire.pose_row_from(message.pose.pose).tobytes() + np.asarray(message.pose.covariance).tobytes()
+        return messages.pose_row_from(message.pose.pose).tobytes() + np.asarray(message.pose.covariance).tobytes()
     return None
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scripted import FIRST_NS, STEP_NS
 
-from hat_ros import lie
+from hat_ros.geometry import lie
 from hat_ros.types import Candidates, Motion
 
 HALF_TURN = lie.so3_exp(np.array([0.0, 0.0, np.pi]))

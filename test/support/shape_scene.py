@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import trimesh
 
-from hat_ros import lie
-from hat_ros.render import create_renderer
-from hat_ros.render.sunlit import Light, SunlitRenderer
-from hat_ros.target import srgb_from_linear, target_from_scene
+from hat_ros.bench.synth.sunlit import Light, SunlitRenderer
+from hat_ros.geometry import lie
+from hat_ros.target.model import srgb_from_linear, target_from_scene
+from hat_ros.target.rendering import create_renderer
 from hat_ros.types import Camera, Frame
 
 CAMERA = Camera(np.array([[500.0, 0, 159.5], [0, 500.0, 119.5], [0, 0, 1]]), 320, 240)

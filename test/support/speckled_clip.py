@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import trimesh
 
-from hat_ros import lie
-from hat_ros.render.embree import EmbreeRenderer
-from hat_ros.target import target_from_scene
+from hat_ros.geometry import lie
+from hat_ros.target.embree import EmbreeRenderer
+from hat_ros.target.model import target_from_scene
 from hat_ros.types import Camera, Detection, Frame, PosePrior
 
 CAMERA = Camera(np.array([[420.0, 0, 159.5], [0, 420.0, 119.5], [0, 0, 1]]), 320, 240)

@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hat_ros import lie
+from hat_ros.bench.temporal import Observations
 from hat_ros.config import load_config
-from hat_ros.temporal import Observations
+from hat_ros.geometry import lie
 
 HALF_TURN = lie.so3_exp(np.array([0.0, np.pi, 0.0]))
 

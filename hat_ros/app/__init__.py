@@ -1,0 +1,1 @@
+"""What runs a tracker on a stream of frames: pipeline, scheduler, overlay, self-check."""

@@ -1,0 +1,163 @@
+"""``hat doctor``: one check per thing that a run may need, each with what was found and what to do."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import metadata
+
+import numpy as np
+
+from hat_ros.errors import HatError
+
+_REQUIRED = ("numpy", "scipy", "opencv-python-headless", "trimesh", "embreex", "numba", "rosbags", "mcap", "PyYAML",
+             "rich", "matplotlib", "zstandard")  # fmt: skip
+_OPTIONAL = {"torch": "nets", "transformers": "nets", "safetensors": "nets", "pyrender": "gl", "distributed": "cluster"}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the table.
+
+    Attributes:
+        what: what was looked for.
+        verdict: ``ok``; ``missing``: the default preset cannot run; ``optional``: only some backends need it.
+        found: what was found, or what to do.
+    """
+
+    what: str
+    verdict: str
+    found: str
+
+
+def run_checks() -> list[Finding]:
+    """All checks, in the order in which a new user would meet the problems."""
+    checks: tuple[Callable[[], list[Finding]], ...] = (
+        _python,
+        _packages,
+        _presets,
+        _renderer,
+        _cache,
+        _ros,
+        _optional_packages,
+        _weights,
+    )
+    return [finding for check in checks for finding in check()]
+
+
+def _python() -> list[Finding]:
+    version = ".".join(map(str, sys.version_info[:3]))
+    good = (3, 10) <= sys.version_info[:2] <= (3, 13)
+    return [Finding("Python", "ok" if good else "missing", version if good else f"{version}: 3.10 to 3.13 is needed")]
+
+
+def _packages() -> list[Finding]:
+    missing = [name for name in _REQUIRED if _version(name) is None]
+    if missing:
+        return [Finding("packages", "missing", f"not installed: {', '.join(missing)}; run `make install`")]
+    return [Finding("packages", "ok", ", ".join(f"{name} {_version(name)}" for name in _REQUIRED))]
+
+
+def _optional_packages() -> list[Finding]:
+    out = []
+    for name, extra in _OPTIONAL.items():
+        version = _version(name)
+        found = version or f"not installed; learned backends and extras: pip install 'hat_ros[{extra}]'"
+        out.append(Finding(name, "ok" if version else "optional", found))
+    return out
+
+
+def _version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _presets() -> list[Finding]:
+    from hat_ros.config import load_config, preset_folder, preset_names
+
+    try:
+        names = preset_names()
+        for name in names:
+            load_config(name)
+    except HatError as error:
+        return [Finding("presets", "missing", str(error))]
+    return [Finding("presets", "ok", f"{', '.join(names)} in {preset_folder()}")]
+
+
+def _renderer() -> list[Finding]:
+    import trimesh
+
+    from hat_ros.geometry import lie
+    from hat_ros.target.model import target_from_scene
+    from hat_ros.target.rendering import create_renderer
+    from hat_ros.types import Camera
+
+    target = target_from_scene(trimesh.Scene(trimesh.creation.box((1.0, 1.0, 1.0))), "cube")
+    camera = Camera(np.array([[100.0, 0, 31.5], [0, 100.0, 31.5], [0, 0, 1]]), 64, 64)
+    start = time.perf_counter()
+    mask = create_renderer("embree", target).render(lie.transform(np.eye(3), [0, 0, 4.0]), camera, color=False).mask
+    elapsed_ms = 1e3 * (time.perf_counter() - start)
+    # A unit cube whose near face is 3.5 m away covers 100 / 3.5 pixels a side.
+    side = np.sqrt(np.count_nonzero(mask))
+    if abs(side - 100 / 3.5) > 1.0:
+        return [Finding("renderer", "missing", f"embree drew a cube {side:.1f} px wide instead of {100 / 3.5:.1f} px")]
+    return [Finding("renderer", "ok", f"embree, test view in {elapsed_ms:.1f} ms")]
+
+
+def _cache() -> list[Finding]:
+    from hat_ros.cache import cache_folder
+
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        return [Finding("cache", "missing", f"{folder} is not writable ({error.strerror})")]
+    return [Finding("cache", "ok", str(folder))]
+
+
+def _ros() -> list[Finding]:
+    """In a process of its own: a broken middleware must not take this one down."""
+    environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"} | os.environ
+    probe = [sys.executable, "-c", "import rclpy; print(rclpy.get_rmw_implementation_identifier())"]
+    try:
+        found = subprocess.run(probe, capture_output=True, text=True, timeout=60, env=environment)
+    except subprocess.TimeoutExpired:
+        return [Finding("rclpy", "missing", "importing it takes more than a minute")]
+    if found.returncode != 0:
+        return [Finding("rclpy", "missing", "not importable; run `make install` (hat track works without it)")]
+    out = [Finding("rclpy", "ok", found.stdout.strip())]
+    try:
+        dds = subprocess.run(
+            [sys.executable, "-m", "hat_ros.ros.probe"], capture_output=True, timeout=60, env=environment
+        )
+        good = dds.returncode == 0
+    except subprocess.TimeoutExpired:
+        good = False
+    advice = "no message arrived on this machine: check firewall rules for loopback UDP and that /dev/shm is writable"
+    out.append(
+        Finding("DDS loopback", "ok" if good else "missing", "a message made the round trip" if good else advice)
+    )
+    return out
+
+
+def _weights() -> list[Finding]:
+    from hat_ros.nets.checkpoint import CHECKPOINTS, find, weights_folder
+
+    present = []
+    for name in CHECKPOINTS:
+        try:
+            find(name)
+            present.append(name)
+        except HatError:
+            continue
+    found = f"{weights_folder()}: {', '.join(present) or 'none; only the learned backends need them'}"
+    return [Finding("weights", "ok" if len(present) == len(CHECKPOINTS) else "optional", found)]

@@ -1,0 +1,233 @@
+"""A method run over a recording in this process: admission, frames in flight, timing. No ROS.
+
+The stages are the ones that the graph's nodes own, and frames are admitted by the same rule, so both give the same
+bytes. Clocks are read here, never inside a stage.
+"""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections import deque
+from collections.abc import Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from hat_ros.app.scheduler import Turnstiles
+from hat_ros.bench.methods import Method
+from hat_ros.core.sync import Admission
+from hat_ros.errors import FrameError
+from hat_ros.tracker import Step
+from hat_ros.types import Frame
+
+STAGE_NAMES = ("segmentation", "hypotheses", "motion", "selector", "fusion")
+MEASURED = (
+    "latency_ms",
+    "period_ms",
+    "cpu_ms",
+    "decode_ms",
+    *(f"{name}_ms" for name in STAGE_NAMES),
+    "rss_mib",
+)
+# First frames left out of throughput and latency: compiled code is loaded and caches are filled there.
+WARMUP_FRAMES = 10
+
+
+@dataclass(frozen=True)
+class Processed:
+    """One admitted frame and what came of it.
+
+    Attributes:
+        step: what the stages said.
+        latency_ms: wall time from admission to the answer, waiting behind frames in flight included.
+        decode_ms: wall time of reading and decoding the frame before that, beside earlier frames.
+        stage_ms: wall time by stage, waiting left out.
+        rss_mib: resident memory of this process after the step.
+        period_ms: wall time from the previous answer, or the start, to this one.
+        cpu_ms: processor time of the whole process in that period.
+    """
+
+    step: Step
+    latency_ms: float
+    decode_ms: float
+    stage_ms: dict[str, float]
+    rss_mib: float
+    period_ms: float = float("nan")
+    cpu_ms: float = float("nan")
+
+    def measured(self) -> tuple[float, ...]:
+        """The values of :data:`MEASURED`, in order."""
+        return (
+            self.latency_ms,
+            self.period_ms,
+            self.cpu_ms,
+            self.decode_ms,
+            *self.stage_ms.values(),
+            self.rss_mib,
+        )
+
+
+class Pipeline:
+    """Feeds the frames of one run to a method.
+
+    Args:
+        method: what estimates the poses.
+        credits: W, frames in flight at once, each in a thread; the answers do not depend on it.
+    """
+
+    def __init__(self, method: Method, credits: int = 1) -> None:
+        self._method = method
+        self._credits = credits if method.concurrent else 1
+        self._turnstiles = Turnstiles(method.stages)
+        self._admission = Admission(self._credits)
+        self.rejected = 0
+
+    @property
+    def causal(self) -> bool:
+        """Whether every step is final."""
+        return self._method.causal
+
+    def run(self, frames: Iterable[Frame | FrameError]) -> Iterator[Processed]:
+        """Process frames, answers in order; those with a late stamp or malformed are counted in ``rejected``.
+
+        An error of the recording is raised after the answers to what was read before it.
+        """
+        in_flight: deque[Future[Processed]] = deque()
+        clock = _Clock()
+        with closing(_ReadAhead(frames)) as attempts, ThreadPoolExecutor(self._credits, "frame") as threads:
+            try:
+                admitted = self._admitted(attempts)
+                failure: Exception | None = None
+
+                def fill() -> None:
+                    nonlocal failure
+                    try:
+                        while self._admission.has_credit and (entry := next(admitted, None)) is not None:
+                            in_flight.append(threads.submit(self._process, *entry))
+                    except Exception as error:  # of reading: what was read before comes first
+                        failure = error
+
+                fill()
+                while in_flight:
+                    done = in_flight.popleft().result()
+                    self._admission.answered(done.step.estimate.stamp_ns)
+                    answer = replace(done, **clock.lap())
+                    fill()  # now: what the caller does with the answer takes its time
+                    yield answer
+                if failure is not None:
+                    raise failure
+            finally:
+                self._turnstiles.close(0)
+
+    def finish(self, steps: list[Step]) -> list[Step]:
+        """The collected steps with the answers of a method that gives them only after the last frame."""
+        return [replace(step, estimate=final) for step, final in zip(steps, self._method.finish(), strict=True)]
+
+    def _admitted(self, attempts: _ReadAhead) -> Iterator[tuple[int, Frame, float]]:
+        """Sequence number, frame and decoding time of the frames that may enter; asked only when there is credit."""
+        for frame, decode_ms in attempts:
+            try:
+                if isinstance(frame, FrameError):
+                    raise frame
+                seq = self._admission.admit(frame.stamp_ns)
+            except FrameError:
+                self.rejected += 1
+                continue
+            yield seq, frame, decode_ms
+
+    def _process(self, seq: int, frame: Frame, decode_ms: float) -> Processed:
+        start = time.perf_counter()
+        with self._turnstiles.frame(seq) as stage_ms:
+            step = self._method.step(frame)
+        latency_ms = 1e3 * (time.perf_counter() - start)
+        stage_ms = {name: stage_ms.get(name, 0.0) for name in STAGE_NAMES}
+        return Processed(step, latency_ms, decode_ms, stage_ms, resident_mib())
+
+
+class _ReadAhead:
+    """Reads and decodes the next frame in a thread while earlier ones are processed: each with its decoding time, ms.
+
+    A recording is read by one thread from beginning to end, as SQLite demands.
+    """
+
+    def __init__(self, frames: Iterable[Frame | FrameError]) -> None:
+        self._frames = iter(frames)
+        self._thread = ThreadPoolExecutor(1, "read")
+        self._next = self._thread.submit(self._read)
+
+    def __iter__(self) -> Iterator[tuple[Frame | FrameError, float]]:
+        while True:
+            frame, decode_ms = self._next.result()
+            if frame is None:
+                return
+            self._next = self._thread.submit(self._read)
+            yield frame, decode_ms
+
+    def close(self) -> None:
+        """End the reading."""
+        if isinstance(self._frames, Generator):
+            self._thread.submit(self._frames.close)
+        self._thread.shutdown()
+
+    def _read(self) -> tuple[Frame | FrameError | None, float]:
+        start = time.perf_counter()
+        frame = next(self._frames, None)
+        return frame, 1e3 * (time.perf_counter() - start)
+
+
+class _Clock:
+    """Wall and processor time between answers."""
+
+    def __init__(self) -> None:
+        self._last = time.perf_counter(), time.process_time()
+
+    def lap(self) -> dict[str, float]:
+        now = time.perf_counter(), time.process_time()
+        wall_s, cpu_s = (b - a for a, b in zip(self._last, now, strict=True))
+        self._last = now
+        return {"period_ms": 1e3 * wall_s, "cpu_ms": 1e3 * cpu_s}
+
+
+def resident_mib() -> float:
+    """Resident memory of this process in MiB; NaN where the system does not say."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    except (OSError, ValueError, IndexError):
+        return float("nan")
+    return pages * resource.getpagesize() / 2**20
+
+
+def memory_summary(rows: list[tuple[float, ...]]) -> dict[str, float]:
+    """How much resident memory grew from the first to the last quarter of a run: medians over rows of MEASURED."""
+    rss_mib = np.array([row[MEASURED.index("rss_mib")] for row in rows])
+    quarter = len(rss_mib) // 4
+    if quarter == 0:
+        return {"memory_growth_mib": float("nan")}
+    # The first quarter begins after warm-up: caches fill there by design.
+    first = rss_mib[min(WARMUP_FRAMES, quarter) :][:quarter]
+    return {"memory_growth_mib": float(np.median(rss_mib[-quarter:]) - np.median(first))}
+
+
+def latency_summary(rows: list[tuple[float, ...]], finish_s: float = 0.0) -> dict[str, float]:
+    """Throughput, latency percentiles and mean time per stage over rows of :data:`MEASURED`, after warm-up.
+
+    Throughput counts everything that is done while the recording runs: decoding, the method, writing of results; and
+    ``finish_s``, what a method that is not causal computes after the last frame.
+    """
+    table = np.array(rows[WARMUP_FRAMES:] or rows, dtype=np.float64).reshape(-1, len(MEASURED))
+    if not len(table):
+        return {"fps": float("nan"), "latency_ms_p50": float("nan"), "latency_ms_p99": float("nan")}
+    column = dict(zip(MEASURED, table.T, strict=True))
+    return {
+        "fps": float(len(table) / (1e-3 * column["period_ms"].sum() + finish_s)),
+        "latency_ms_p50": float(np.percentile(column["latency_ms"], 50)),
+        "latency_ms_p99": float(np.percentile(column["latency_ms"], 99)),
+        "latency_ms_max": float(column["latency_ms"].max()),
+        "cpu_ms_mean": float(column["cpu_ms"].mean()),
+        "decode_ms_mean": float(column["decode_ms"].mean()),
+        **{f"{name}_ms_mean": float(column[f"{name}_ms"].mean()) for name in STAGE_NAMES},
+    }

@@ -1,0 +1,203 @@
+"""A recording whose frames are image files: what every data set's reader builds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hat_ros.errors import DatasetError, FrameError
+from hat_ros.geometry import lie
+from hat_ros.types import Camera, Frame
+
+if TYPE_CHECKING:
+    from hat_ros.io.detections import DetectionLookup
+
+# Sequences without a clock: 10 frames a second from one second on, so that no stamp is zero.
+FIRST_STAMP_NS = 1_000_000_000
+FRAME_STEP_NS = 100_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class ImageFile:
+    """One frame on disk.
+
+    Attributes:
+        stamp_ns: exposure stamp.
+        image: 8-bit colour or grey image file.
+        T_cam_target: (4, 4) truth, None when unknown.
+        masks: image files of the target's visible silhouette (> 127 inside), joined; empty = none given.
+        box_xyxy: (4,) detection box in pixels of the undistorted image, used when there is no mask; None = none.
+    """
+
+    stamp_ns: int
+    image: Path
+    T_cam_target: NDArray[np.float64] | None = None
+    masks: tuple[Path, ...] = ()
+    box_xyxy: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ImageRecording:
+    """Image files with one calibration.
+
+    Attributes:
+        name: for tables.
+        camera: calibration of the frames handed out, without distortion.
+        target_path: the CAD model.
+        files: the frames in order.
+        distortion: OpenCV coefficients of the files' lens; frames are undistorted to ``camera``. Empty = none.
+        unit_scale: metres per unit of the CAD file.
+        detections: masks and boxes computed elsewhere, on the images as stored; where given, the files' own masks and
+            boxes do not count.
+        scene: (scene, object) numbers of a BOP data set, by which detections of many are told apart.
+    """
+
+    name: str
+    camera: Camera
+    target_path: Path
+    files: Sequence[ImageFile]
+    distortion: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    unit_scale: float = 1.0
+    detections: DetectionLookup | None = None
+    scene: tuple[int, int] | None = None
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def frames(self, limit: int | None = None, masks: bool = True) -> Iterator[Frame]:
+        """Decoded frames in order, with or without what is known of the target's place in them.
+
+        Raises:
+            DatasetError: a file is missing, cannot be decoded, or has another size than the calibration says.
+        """
+        for item in self.files[:limit]:
+            yield self.frame(item, masks)
+
+    def frame(self, item: ImageFile, mask: bool = True) -> Frame:
+        """Decode one frame; errors as in :meth:`frames`."""
+        rgb = self._rectify(read_rgb(item.image), item.image, cv2.INTER_LINEAR)
+        return Frame(item.stamp_ns, rgb, self.camera, self.given_mask(item) if mask else None)
+
+    def given_mask(self, item: ImageFile) -> NDArray[np.uint8] | None:
+        """(H, W) uint8 as in ``Frame.given_mask``, None when the frame brings no detection at all."""
+        if self.detections is not None:
+            mask = self.detections.given_mask(item.image.name, (self.camera.height, self.camera.width))
+            return None if mask is None else self._rectify(mask, item.image, cv2.INTER_NEAREST)
+        if item.masks:
+            inside = np.zeros((self.camera.height, self.camera.width), bool)
+            for path in item.masks:
+                inside |= self._rectify(_read(path, cv2.IMREAD_GRAYSCALE), path, cv2.INTER_NEAREST) > 127
+            return inside.astype(np.uint8) * np.uint8(255)
+        if item.box_xyxy is not None:
+            mask = np.zeros((self.camera.height, self.camera.width), np.uint8)
+            x0, y0 = np.clip(np.ceil(item.box_xyxy[:2]), 0, None).astype(int)
+            x1, y1 = np.clip(np.floor(item.box_xyxy[2:]) + 1, 0, None).astype(int)
+            mask[y0:y1, x0:x1] = 128
+            return mask
+        return None
+
+    def truth(self) -> dict[int, NDArray[np.float64]]:
+        """Stamp -> (4, 4) ``T_cam_target`` of the labelled frames."""
+        return {item.stamp_ns: item.T_cam_target for item in self.files if item.T_cam_target is not None}
+
+    @cached_property
+    def _maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        size = (self.camera.width, self.camera.height)
+        return cv2.initUndistortRectifyMap(self.camera.K, self.distortion, None, self.camera.K, size, cv2.CV_32FC1)
+
+    def _rectify(self, image: NDArray[np.uint8], path: Path, interpolation: int) -> NDArray[np.uint8]:
+        if image.shape[:2] != (self.camera.height, self.camera.width):
+            raise DatasetError(
+                f"{path}: image is {image.shape[1]}x{image.shape[0]}, "
+                f"the calibration says {self.camera.width}x{self.camera.height}"
+            )
+        if not self.distortion.any():
+            return image
+        return cv2.remap(image, *self._maps, interpolation)
+
+
+def read_rgb(path: Path) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 RGB of an image file; grey is repeated.
+
+    Raises:
+        DatasetError: missing or not an image.
+    """
+    return cv2.cvtColor(_read(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+
+
+def _read(path: Path, flags: int) -> NDArray[np.uint8]:
+    try:
+        data = np.fromfile(path, dtype=np.uint8)
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read ({error.strerror})") from None
+    # Bits per channel and EXIF rotation as stored: labels refer to the stored pixels.
+    image = cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
+    if image is None:
+        raise DatasetError(f"{path}: not an image that can be decoded; copy the data set again")
+    return image
+
+
+def pose_from_label(
+    quat: Sequence[float], translation_m: Sequence[float], order: str, where: str
+) -> NDArray[np.float64]:
+    """(4, 4) ``T_cam_target`` from a label with ``p_cam = R(q) p + t``.
+
+    Args:
+        quat: four numbers in the given order; normalised here.
+        translation_m: three numbers.
+        order: ``wxyz`` or ``xyzw``.
+        where: for the error: file and entry.
+
+    Raises:
+        DatasetError: wrong counts, not numbers, not finite, or a quaternion far from unit length.
+    """
+    try:
+        q, t = np.asarray(quat, dtype=np.float64), np.asarray(translation_m, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise DatasetError(f"{where}: pose label is not made of numbers: {quat}, {translation_m}") from None
+    if q.shape != (4,) or t.shape != (3,) or not (np.isfinite(q).all() and np.isfinite(t).all()):
+        raise DatasetError(f"{where}: pose label needs 4 + 3 finite numbers, found {q.tolist()} and {t.tolist()}")
+    if abs(np.linalg.norm(q) - 1.0) > 0.01:
+        raise DatasetError(f"{where}: quaternion has length {np.linalg.norm(q):.4f}, expected 1")
+    return lie.transform(lie.matrix_from_quat(q[[1, 2, 3, 0]] if order == "wxyz" else q), t)
+
+
+def camera_from_label(K: object, size: Sequence[int], where: str) -> Camera:
+    """Camera of a data set that gives K and [width, height].
+
+    A principal point of exactly half the image size counts from the image corner (renderers do): it is moved by half
+    a pixel to our convention of integer pixel centres. Any other value comes from a calibration and is kept.
+
+    Raises:
+        DatasetError: not a camera matrix, or no image size.
+    """
+    try:
+        matrix = np.array(K, dtype=np.float64).reshape(3, 3)
+        width, height = (int(value) for value in size)
+        if matrix[0, 2] == width / 2 and matrix[1, 2] == height / 2:
+            matrix[:2, 2] -= 0.5
+        return Camera(matrix, width, height)
+    except (TypeError, ValueError, FrameError) as error:
+        raise DatasetError(f"{where}: camera matrix 3x3 and image size expected ({error})") from None
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """(width, height) of an image file.
+
+    Raises:
+        DatasetError: missing or not an image.
+    """
+    height, width = _read(path, cv2.IMREAD_UNCHANGED).shape[:2]
+    return width, height
+
+
+def stamp_of(index: int) -> int:
+    """Stamp of frame ``index`` in a sequence without a clock."""
+    return FIRST_STAMP_NS + index * FRAME_STEP_NS

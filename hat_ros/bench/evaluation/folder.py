@@ -1,0 +1,159 @@
+"""The last steps of any run, and what can be done with a finished one: everything derived from the result bag."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hat_ros.app.overlay import OverlayPainter, VideoFile
+from hat_ros.bench.evaluation.figures import error_figure, image_bytes, range_figure
+from hat_ros.bench.evaluation.pose_tables import write_tables
+from hat_ros.bench.evaluation.report import write_report
+from hat_ros.bench.evaluation.score import score_run
+from hat_ros.bench.source import Source, SourceSpec, open_source
+from hat_ros.bench.temporal_replay import save_observations
+from hat_ros.errors import BagError, HatError, RunError, UsageError
+from hat_ros.io.result_bag import read_result_bag
+from hat_ros.io.results import BAG_FOLDER, CONFIG_FILE, METRICS_FILE, RUN_FILE, write_json
+from hat_ros.io.run_log import RunLog
+from hat_ros.types import Frame, TrackState
+
+OBSERVATIONS_FILE = "observations.npz"
+# Overlay frames shown in the report.
+STRIP_FRAMES = 12
+_STRIP_WIDTH_PX = 640
+
+
+def complete_folder(folder: Path, source: Source | None, measured: dict[str, Any], video: bool, report: bool) -> None:
+    """Derive everything else of a result folder from its bag: tables, metrics, report, overlay.
+
+    Args:
+        folder: holds ``bag``, ``config.yaml`` and ``run.json``.
+        source: the recording, for overlay and ADD-S; None leaves both out.
+        measured: what the run itself measured (speed, memory, masks); goes into ``metrics.json``.
+        video: write the overlay video.
+        report: write ``report.html``.
+
+    Raises:
+        BagError: the result bag is missing or damaged.
+    """
+    log = read_result_bag(folder / BAG_FOLDER)
+    figures = score_run(log, source.target if source else None) | measured
+    write_tables(folder, log)
+    run = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+    if run.get("mode") == "observe":
+        save_observations(folder / OBSERVATIONS_FILE, log)
+    write_json(folder / METRICS_FILE, figures)
+    strip = paint_overlay(folder, source, log, video) if source and (video or report) else []
+    if report:
+        _report(folder, log, figures, strip)
+
+
+def evaluate_folder(folder: Path, truth: Path | None = None) -> None:
+    """Score a finished run again, perhaps against another truth, and rewrite tables, metrics and report.
+
+    Args:
+        folder: result folder; what the run itself measured is kept from its ``metrics.json``.
+        truth: recording whose truth counts; by default the one that is in the result bag.
+
+    Raises:
+        UsageError: it is no result folder.
+        BagError: a bag is damaged, or the recording has no truth for these frames.
+    """
+    run, figures, _ = read_folder(folder)
+    log = read_result_bag(folder / BAG_FOLDER)
+    source = open_source(truth) if truth is not None else _source_of(run)
+    if truth is not None:
+        first, last = int(log.stamp_ns[0]), int(log.stamp_ns[-1])
+        log = log.with_truth({stamp: row for stamp, row in source.truth_rows().items() if first <= stamp <= last})
+        if not log.has_truth.any():
+            raise BagError(f"{truth} has no true pose at any stamp of {folder}: is it the recording of this run?")
+    figures |= score_run(log, source.target if source else None)
+    write_tables(folder, log)
+    write_json(folder / METRICS_FILE, figures)
+    _report(folder, log, figures, paint_overlay(folder, source, log, video=False) if source else [])
+
+
+def plot_folder(folder: Path, out: Path, form: str) -> list[Path]:
+    """Draw a finished run into image files of the given format; returns their paths."""
+    _, figures, _ = read_folder(folder)
+    log = read_result_bag(folder / BAG_FOLDER)
+    drawn = {"errors": error_figure(log)}
+    if figures.get("range_bins"):
+        drawn["range"] = range_figure(figures["range_bins"])
+    paths = [out / f"{name}.{form}" for name in drawn]
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for path, figure in zip(paths, drawn.values(), strict=True):
+            path.write_bytes(image_bytes(figure, form))
+    except OSError as error:
+        raise RunError(f"cannot write {out}: {error.strerror}") from None
+    return paths
+
+
+def read_folder(folder: Path) -> tuple[dict[str, Any], dict[str, Any], str]:
+    """``run.json``, ``metrics.json`` and ``config.yaml`` of a result folder.
+
+    Raises:
+        UsageError: one of them is missing or unreadable.
+    """
+    try:
+        run = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+        figures = json.loads((folder / METRICS_FILE).read_text(encoding="utf-8"))
+        return run, figures, (folder / CONFIG_FILE).read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "not valid JSON"
+        raise UsageError(f"{folder} is no finished result folder ({reason}): give the --out of a run") from None
+
+
+def _source_of(run: dict[str, Any]) -> Source | None:
+    """The recording that a run was made from, None when it is no longer there."""
+    try:
+        model = run.get("model")
+        spec = SourceSpec(Path(run["source"]), run.get("dataset", ""), run.get("sequence", ""), model and Path(model))
+        return spec.open()
+    except HatError:
+        return None
+
+
+def _report(folder: Path, log: RunLog, figures: dict[str, Any], strip: list[tuple[str, NDArray[np.uint8]]]) -> None:
+    run, _, config_text = read_folder(folder)
+    title = f"{Path(run['source']).name}: {run.get('mode', 'hat')}"
+    write_report(folder / "report.html", title, log, figures, run, config_text, strip)
+
+
+def paint_overlay(folder: Path, source: Source, log: RunLog, video: bool) -> list[tuple[str, NDArray[np.uint8]]]:
+    """Draw the run into its images: the video, and captioned frames for the report."""
+    if not len(log):
+        return []
+    wanted = {int(log.stamp_ns[i]) for i in np.linspace(0, len(log) - 1, STRIP_FRAMES).astype(int)}
+    index = {int(stamp): i for i, stamp in enumerate(log.stamp_ns)}
+    painter, camera = OverlayPainter(source.target), source.recording.camera
+    file = VideoFile(folder / "overlay", camera.width, camera.height, _frame_rate(log)) if video else None
+    strip = []
+    for frame in source.frames():
+        i = index.pop(frame.stamp_ns, None) if isinstance(frame, Frame) else None
+        if i is None or not (video or frame.stamp_ns in wanted):
+            continue
+        state, note = TrackState(int(log.state[i])), f"{(log.stamp_ns[i] - log.stamp_ns[0]) * 1e-9:.1f} s"
+        pose_row = log.pose_rows[i] if log.has_output[i] else np.full(7, np.nan)
+        image = painter.paint(frame.rgb, camera, state, pose_row, note, log.truth_rows[i])
+        if file is not None:
+            file.add(image)
+        if frame.stamp_ns in wanted:
+            scale = min(1.0, _STRIP_WIDTH_PX / camera.width)
+            strip.append((f"{note}, {state.name}", cv2.resize(image, None, fx=scale, fy=scale)))
+    if file is not None:
+        file.close()
+    return strip
+
+
+def _frame_rate(log: RunLog) -> float:
+    """Frames per second of the recording, within what players accept."""
+    period_s = float(np.median(np.diff(log.stamp_ns))) * 1e-9 if len(log) > 1 else 0.1
+    return float(np.clip(1.0 / period_s, 1.0, 60.0))

@@ -1,0 +1,66 @@
+"""The ways to turn the same front ends into poses: HAT, and what to compare it with.
+
+* ``hat``: the method of the paper.
+* ``independent``: hypotheses at every frame; the best appearance is the output. No memory.
+* ``tracking``: refine the previous pose on each image; the best appearance only to (re-)start. No decoder, no fusion.
+* ``offline``: HAT's observations in hindsight. Not causal: a reference (:mod:`hat_ros.bench.methods.offline`).
+* ``srt3d``: the region tracker of :mod:`hat_ros.bench.methods.srt3d`, started by the best appearance, never again.
+* ``observe``: the front ends alone, candidates at every frame and no output: what temporal sweeps run on.
+
+Each offers what :class:`~hat_ros.tracker.HatTracker` offers, so the pipeline runs them all alike.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any, Protocol
+
+from hat_ros.config import HatConfig
+from hat_ros.errors import UsageError
+from hat_ros.target.model import Target
+from hat_ros.tracker import Step
+from hat_ros.types import Estimate, Frame
+
+_METHODS = {
+    "hat": "framewise:Hat",
+    "independent": "framewise:Independent",
+    "tracking": "framewise:Tracking",
+    "offline": "offline:Offline",
+    "srt3d": "srt3d:Srt3d",
+    "observe": "framewise:Observe",
+}
+MODES = tuple(_METHODS)
+
+
+class Method(Protocol):
+    """What turns frames into poses."""
+
+    causal: bool
+    """Whether ``step`` gives the final answer; if not, :meth:`finish` does."""
+
+    concurrent: bool
+    """Whether steps of several frames may overlap by the rules of :mod:`hat_ros.app.scheduler`."""
+
+    stages: dict[str, Any]
+    """Stage name -> the object whose ``update`` is that stage; for timing."""
+
+    def step(self, frame: Frame) -> Step:
+        """Process one frame, stamps strictly increasing."""
+        ...
+
+    def finish(self) -> list[Estimate]:
+        """The estimates of all frames, for a method that is not causal; empty otherwise."""
+        ...
+
+
+def create_method(mode: str, config: HatConfig, target: Target) -> Method:
+    """Build the method that ``--mode`` names.
+
+    Raises:
+        UsageError: unknown mode.
+        ConfigError: the configuration names an unknown backend.
+    """
+    if mode not in _METHODS:
+        raise UsageError(f"mode '{mode}' is unknown, choose one of {', '.join(MODES)}")
+    module, _, name = _METHODS[mode].partition(":")
+    return getattr(import_module(f"hat_ros.bench.methods.{module}"), name)(config, target)

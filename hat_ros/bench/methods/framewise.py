@@ -1,0 +1,174 @@
+"""The methods that answer frame by frame; see :mod:`hat_ros.bench.methods`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hat_ros.config import HatConfig
+from hat_ros.hypotheses.stage import HypothesisStage
+from hat_ros.motion.stage import MotionStage
+from hat_ros.refinement import create_refiner
+from hat_ros.segmentation.stage import SegmentationStage
+from hat_ros.target.model import Target
+from hat_ros.tracker import HatTracker, Step
+from hat_ros.tracking.refiner import Refiner
+from hat_ros.types import Candidates, Detection, Estimate, Frame, Motion, Refined, Selection, TrackState
+
+_NO_POSE = np.full(7, np.nan)
+_NO_COVARIANCE = np.full((6, 6), np.nan)
+
+
+class Hat:
+    """The method of the paper, as :class:`HatTracker` runs it."""
+
+    causal = True
+    concurrent = True
+
+    def __init__(self, config: HatConfig, target: Target) -> None:
+        self._tracker = HatTracker(config, target)
+        self.stages = {
+            name: getattr(self._tracker, name)
+            for name in ("segmentation", "hypotheses", "motion", "selector", "fusion")
+        }
+
+    def step(self, frame: Frame) -> Step:
+        """See :meth:`HatTracker.step`."""
+        return self._tracker.step(frame)
+
+    def finish(self) -> list[Estimate]:
+        """Nothing: HAT never revises."""
+        return []
+
+
+class Independent:
+    """Every frame for itself: its best-scored hypothesis, or no pose."""
+
+    causal = True
+    concurrent = True
+
+    def __init__(self, config: HatConfig, target: Target) -> None:
+        config = replace(config, keyframes=replace(config.keyframes, gap_frames=1))
+        self._segmentation = SegmentationStage(config, target)
+        self._hypotheses = HypothesisStage(config, target)
+        self.stages = {"segmentation": self._segmentation, "hypotheses": self._hypotheses}
+
+    def step(self, frame: Frame) -> Step:
+        """One image, one answer."""
+        detection = self._segmentation.update(frame, None)
+        candidates = self._hypotheses.update(frame, detection, None)
+        return _step(detection, candidates, _best_appearance(frame, candidates))
+
+    def finish(self) -> list[Estimate]:
+        """Nothing: every answer is final."""
+        return []
+
+
+class Tracking:
+    """The previous pose, refined on each image; the best appearance where there is no track to follow."""
+
+    causal = True
+    concurrent = False  # a step follows the pose of the one before
+
+    def __init__(self, config: HatConfig, target: Target) -> None:
+        config = replace(
+            config,
+            keyframes=replace(config.keyframes, gap_frames=1),
+            refinement=replace(config.refinement, enabled=True),
+        )
+        self._segmentation = SegmentationStage(config, target)
+        self._hypotheses = HypothesisStage(config, target)
+        self._refinement = _LastPose(create_refiner(config, target))
+        self.stages = {
+            "segmentation": self._segmentation,
+            "hypotheses": self._hypotheses,
+            "fusion": self._refinement,
+        }
+
+    def step(self, frame: Frame) -> Step:
+        """Follow, or start afresh."""
+        detection = self._segmentation.update(frame, None)
+        refined = self._refinement.update(frame, detection)
+        if refined is not None:
+            estimate = Estimate(frame.stamp_ns, TrackState.TRACKING, refined.pose_row, refined.covariance)
+            return _step(detection, Candidates.none(), estimate)
+        candidates = self._hypotheses.update(frame, detection, None)
+        estimate = _best_appearance(frame, candidates)
+        self._refinement.start(estimate)
+        return _step(detection, candidates, estimate)
+
+    def finish(self) -> list[Estimate]:
+        """Nothing: every answer is final."""
+        return []
+
+
+class _LastPose:
+    """The track of :class:`Tracking`."""
+
+    def __init__(self, refiner: Refiner) -> None:
+        self._refiner = refiner
+        self._T_cam_target: np.ndarray | None = None
+
+    def start(self, estimate: Estimate) -> None:
+        """Follow this pose from the next frame on."""
+        self._T_cam_target = estimate.T_cam_target if estimate.state.has_pose else None
+
+    def update(self, frame: Frame, detection: Detection | None) -> Refined | None:
+        """The last pose refined on this image; None when there is no track or it is lost here."""
+        if self._T_cam_target is None:
+            return None
+        refined = self._refiner.refine(frame, detection, self._T_cam_target)
+        self._T_cam_target = None if refined is None else refined.T_cam_target
+        return refined
+
+
+class Observe:
+    """What the front ends see when nobody asks for a pose: candidates at every frame, motion, no priors."""
+
+    causal = True
+    concurrent = True
+
+    def __init__(self, config: HatConfig, target: Target) -> None:
+        config = replace(config, keyframes=replace(config.keyframes, gap_frames=1))
+        self._segmentation = SegmentationStage(config, target)
+        self._hypotheses = HypothesisStage(config, target)
+        self._motion = MotionStage(config, target)
+        self.stages = {"segmentation": self._segmentation, "hypotheses": self._hypotheses, "motion": self._motion}
+
+    def step(self, frame: Frame) -> Step:
+        """Look, and say nothing."""
+        detection = self._segmentation.update(frame, None)
+        motion = self._motion.update(frame, detection, None)
+        candidates = self._hypotheses.update(frame, detection, None)
+        nothing = Estimate(
+            frame.stamp_ns,
+            TrackState.UNINITIALISED,
+            _NO_POSE,
+            _NO_COVARIANCE,
+            keyframe=len(candidates) > 0,
+            n_candidates=len(candidates),
+            slam_epoch=motion.epoch,
+        )
+        return Step(detection, candidates, motion, Selection.none(), nothing)
+
+    def finish(self) -> list[Estimate]:
+        """Nothing."""
+        return []
+
+
+def _best_appearance(frame: Frame, candidates: Candidates) -> Estimate:
+    found = len(candidates) > 0 and bool(np.isfinite(candidates.log_score[0]))
+    return Estimate(
+        frame.stamp_ns,
+        TrackState.TRACKING if found else TrackState.LOST,
+        candidates.pose_rows[0] if found else _NO_POSE,
+        _NO_COVARIANCE,
+        keyframe=len(candidates) > 0,
+        n_candidates=len(candidates),
+        anchor=0 if found else -1,
+    )
+
+
+def _step(detection: Detection | None, candidates: Candidates, estimate: Estimate) -> Step:
+    return Step(detection, candidates, Motion.none(), Selection.none(), estimate)

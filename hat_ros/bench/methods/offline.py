@@ -1,0 +1,188 @@
+"""The offline reference: what hindsight makes of the observations of HAT. Never causal.
+
+After the paper's "Causal and Offline Performance Comparison": motion by global bundle adjustment where the backend can
+(DROID-SLAM), the decoder's path traced back, one verdict of the gate over the whole sequence, all poses optimised
+jointly, then dense refinement of every frame, which never leaves the basin of the anchors. Here the refined poses are
+measurements, as they are for the causal method: a last joint optimisation ties them to each other by the motion.
+Without refinement in the configuration the poses of the anchors stand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from hat_ros.bench.methods.framewise import Hat
+from hat_ros.bench.methods.smoothing import smooth_measured, solve_offline
+from hat_ros.config import HatConfig
+from hat_ros.geometry import lie
+from hat_ros.motion.stage import suppress_background
+from hat_ros.refinement import create_refiner
+from hat_ros.stages import offline_motions_of
+from hat_ros.target.model import Target
+from hat_ros.tracker import Step
+from hat_ros.tracking.image_fusion import is_supported, quality
+from hat_ros.types import Camera, Detection, Estimate, Float, Frame, Motion, Refined, TrackState
+
+# The paper's dense refinement rejects what lies further than this from the anchors.
+_SAME_BASIN_DEG = 90.0
+_NO_COVARIANCE = np.full((6, 6), np.nan)
+
+
+class Offline:
+    """HAT's stages frame by frame, and the answer to all frames at the end."""
+
+    causal = False
+    concurrent = False
+
+    def __init__(self, config: HatConfig, target: Target) -> None:
+        self._config = config
+        self._hat = Hat(config, target)
+        self._refiner = create_refiner(config, target)
+        self._offline_motions = offline_motions_of(config)
+        self._steps: list[Step] = []
+        self._images = _StoredClip(config.slam.masked)
+        self.stages = self._hat.stages
+
+    def step(self, frame: Frame) -> Step:
+        """Observe; the estimate in the returned step is the causal one."""
+        step = self._hat.step(frame)
+        self._steps.append(replace(step, detection=None))
+        if self._refiner is not None or self._offline_motions is not None:
+            self._images.append(frame, step.detection)
+        return step
+
+    def finish(self) -> list[Estimate]:
+        """Adjust globally, decode, align, optimise jointly; refine on the images, and optimise again."""
+        steps = self._steps
+        if not steps:
+            return []
+        motions = self._motions()
+        result = solve_offline([step.candidates for step in steps], motions, self._config)
+        T_final, covariances = result.T_cam_target, [_NO_COVARIANCE] * len(steps)
+        if self._refiner is not None:
+            T_final = self._best_known(T_final, result.tied)
+            measured = [self._measured(index, T) for index, T in enumerate(T_final)]
+            covariances = [covariance for _, covariance in measured]
+            smooth = smooth_measured(np.stack([T for T, _ in measured]), motions, self._config)
+            T_final = np.where(np.isfinite(smooth), smooth, T_final)
+        estimates = []
+        for index, (step, T, covariance) in enumerate(zip(steps, T_final, covariances, strict=True)):
+            known = bool(np.isfinite(T).all())
+            estimates.append(
+                replace(
+                    step.estimate,
+                    state=TrackState.TRACKING if known else TrackState.LOST,
+                    pose_row=lie.row_from_matrix(T) if known else np.full(7, np.nan),
+                    covariance=covariance,
+                    anchor=int(result.chosen[index]),
+                    gate_weight=float(result.gate_weight[index]),
+                    gap_frames=0,
+                )
+            )
+        return estimates
+
+    def _motions(self) -> list[Motion]:
+        """By hindsight where the backend has any; not for a clip on which it never got going."""
+        causal = [step.motion for step in self._steps]
+        if self._offline_motions is None or not any(motion.valid for motion in causal):
+            return causal
+        return self._offline_motions(self._config, self._images)
+
+    def _best_known(self, T_decided: Float, tied: NDArray[np.bool_]) -> Float:
+        """Poses (N, 4, 4): the decided ones, and the causal ones where no motion ties the decided to other frames.
+
+        There hindsight knows no more than the causal method did.
+        """
+        out = T_decided.copy()
+        for index in np.flatnonzero(~tied):
+            causal = self._steps[index].estimate
+            if causal.state.has_pose:
+                out[index] = causal.T_cam_target
+        return out
+
+    def _measured(self, index: int, T_decided: Float) -> tuple[Float, Float]:
+        """The pose (4, 4) that the image of a frame supports near the decided one, and its covariance; NaN: none.
+
+        What the causal method measured in the decided basin stands, unless the image clearly prefers another pose
+        there: it began closer, at the frame before.
+        """
+        causal, config = self._steps[index].estimate, self._config.refinement
+        T_causal = causal.T_cam_target if causal.state.has_pose else None
+        starts = [T_decided] if np.isfinite(T_decided).all() else []
+        if starts and T_causal is not None and (apart_deg := _apart_deg(T_causal, T_decided)) < _SAME_BASIN_DEG:
+            was_measured = causal.gap_frames == 0
+            if was_measured and apart_deg <= config.same_pose_deg:
+                return T_causal, causal.covariance
+            if apart_deg > config.same_pose_deg:
+                starts.insert(0 if was_measured else 1, T_causal)
+        best = None
+        for T_start in starts:
+            refined = self._refined(index, T_start)
+            if quality(refined) > quality(best) + (config.switch_margin if is_supported(best, config) else 0.0):
+                best = refined
+        if is_supported(best, config):
+            return best.T_cam_target, best.covariance
+        return np.full((4, 4), np.nan), _NO_COVARIANCE
+
+    def _refined(self, index: int, T_cam_target: Float) -> Refined | None:
+        frame, detection = self._images.load(index)
+        return self._refiner.refine(frame, detection, T_cam_target)
+
+
+def _apart_deg(T_a: Float, T_b: Float) -> float:
+    return float(np.degrees(lie.angle_between(T_a[:3, :3], T_b[:3, :3])))
+
+
+class _StoredClip(Sequence[tuple[Frame, "Detection | None"]]):
+    """All frames in little memory; as a sequence they are what the motion stage's backend sees."""
+
+    def __init__(self, masked: bool) -> None:
+        self._masked = masked
+        self._images: list[_StoredImage] = []
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def __getitem__(self, index: int) -> tuple[Frame, Detection | None]:
+        frame, detection = self._images[index].load()
+        if self._masked and detection is not None:
+            frame = replace(frame, rgb=suppress_background(frame.rgb, detection.mask))
+        return frame, detection
+
+    def append(self, frame: Frame, detection: Detection | None) -> None:
+        """Keep one more."""
+        self._images.append(_StoredImage.of(frame, detection))
+
+    def load(self, index: int) -> tuple[Frame, Detection | None]:
+        """One frame as it came."""
+        return self._images[index].load()
+
+
+@dataclass(frozen=True)
+class _StoredImage:
+    """A frame and its detection, compressed without loss."""
+
+    stamp_ns: int
+    camera: Camera
+    png: np.ndarray
+    mask_bits: np.ndarray | None
+    silhouette: bool
+
+    @classmethod
+    def of(cls, frame: Frame, detection: Detection | None) -> _StoredImage:
+        png = cv2.imencode(".png", frame.rgb, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+        bits = None if detection is None else np.packbits(detection.mask)
+        return cls(frame.stamp_ns, frame.camera, png, bits, detection is not None and detection.silhouette)
+
+    def load(self) -> tuple[Frame, Detection | None]:
+        frame = Frame(self.stamp_ns, cv2.imdecode(self.png, cv2.IMREAD_COLOR), self.camera)
+        if self.mask_bits is None:
+            return frame, None
+        shape = (self.camera.height, self.camera.width)
+        mask = np.unpackbits(self.mask_bits, count=shape[0] * shape[1]).reshape(shape).astype(bool)
+        return frame, Detection(mask, self.silhouette)

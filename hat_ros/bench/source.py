@@ -1,0 +1,187 @@
+"""What a run is made from: a bag, a clip of the ``sequence`` layout, or one sequence of a data set as published."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hat_ros.bench.datasets.image_files import ImageRecording
+from hat_ros.bench.datasets.importer import open_dataset, with_annotation_boxes, with_detections
+from hat_ros.bench.datasets.sequence import load_sequence
+from hat_ros.errors import BagError, DatasetError, FrameError, UsageError
+from hat_ros.geometry import lie
+from hat_ros.io.bag import BagReader, Packet, deserialize
+from hat_ros.io.images import decode_image, decode_mask
+from hat_ros.io.provenance import input_hash
+from hat_ros.target.model import Target, load_target
+from hat_ros.types import Frame
+
+
+@dataclass(frozen=True)
+class SourceSpec:
+    """Where a recording is.
+
+    Attributes:
+        path: bag, sequence folder, or root folder of a data set.
+        dataset: layout of the data set (``spark``, ``shirt``, ...); empty = ``path`` is one recording.
+        sequence: name of the sequence within the data set.
+        model: CAD model, for data sets that bring none.
+        detections: masks or boxes of this sequence computed elsewhere, see ``datasets.importer.with_detections``.
+    """
+
+    path: Path
+    dataset: str = ""
+    sequence: str = ""
+    model: Path | None = None
+    detections: Path | None = None
+
+    @property
+    def name(self) -> str:
+        """Name for tables and folders."""
+        return (self.sequence if self.dataset else self.path.resolve().name).replace("/", "_")
+
+    @property
+    def group(self) -> str:
+        """What it belongs to: the data set, or the folder that it lies in."""
+        return self.dataset or self.path.resolve().parent.name
+
+    def sha256(self) -> str:
+        """Digest of everything that the recording is made of."""
+        if not self.dataset:
+            return input_hash(self.path) if self.detections is None else self._with_detections(input_hash(self.path))
+        recording = self._in_dataset()
+        digest = hashlib.sha256(recording.camera.K.tobytes() + recording.distortion.tobytes())
+        for item in recording.files:
+            truth = b"" if item.T_cam_target is None else item.T_cam_target.tobytes()
+            box = b"" if item.box_xyxy is None else np.asarray(item.box_xyxy, dtype=np.float64).tobytes()
+            digest.update(b"\0".join((str(item.stamp_ns).encode(), truth, box)))
+            for path in (item.image, *item.masks):
+                digest.update(input_hash(path).encode())
+        digest.update(input_hash(recording.target_path).encode())
+        return digest.hexdigest() if self.detections is None else self._with_detections(digest.hexdigest())
+
+    def _with_detections(self, rest: str) -> str:
+        return hashlib.sha256(f"{rest}{input_hash(self.detections)}".encode()).hexdigest()
+
+    def describe(self) -> dict[str, str | None]:
+        """What ``run.json`` says about where it is, beside ``source`` itself."""
+        return {
+            "dataset": self.dataset,
+            "sequence": self.sequence,
+            "model": self.model and str(self.model.resolve()),
+            "detections": self.detections and str(self.detections.resolve()),
+            "detections_sha256": self.detections and input_hash(self.detections),
+        }
+
+    def open(self) -> Source:
+        """Open the recording and its CAD model.
+
+        Raises:
+            UsageError: there is nothing of that name, or it is no recording.
+            InputError: it is malformed, or no CAD model lies beside it.
+        """
+        if self.dataset:
+            return _source_of_images(self.path, self._in_dataset())
+        return open_source(self.path, self.detections)
+
+    def _in_dataset(self) -> ImageRecording:
+        for recording in open_dataset(self.dataset, self.path, self.model, (self.sequence,)):
+            if self.detections is not None:
+                return with_detections(recording, self.detections)
+            # SHIRT has neither masks nor a published detector: the paper takes the regions from the labels.
+            return with_annotation_boxes(recording) if self.dataset == "shirt" else recording
+        raise DatasetError(f"{self.path}: no sequence named {self.sequence}")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A recording that was opened, with its target."""
+
+    path: Path
+    recording: ImageRecording | BagReader
+    target: Target
+
+    def frames(self, start: int = 0, limit: int | None = None, masks: bool = True) -> Iterator[Frame | FrameError]:
+        """Frames from number ``start`` on, at most ``limit`` of them; a malformed one comes as its error.
+
+        ``masks``: with the recorded ones.
+        """
+        stop, recording = None if limit is None else start + limit, self.recording
+        bag = isinstance(recording, BagReader)
+        return islice(_attempts(recording, masks) if bag else recording.frames(stop, masks), start, stop)
+
+    def masks(self, start: int = 0, limit: int | None = None) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+        """Stamps and recorded masks of the same frames, images left alone."""
+        recording, stop = self.recording, None if limit is None else start + limit
+        if isinstance(recording, BagReader):
+            return islice(_masks(recording), start, stop)
+        return ((item.stamp_ns, recording.given_mask(item)) for item in recording.files[start:stop])
+
+    def count(self, start: int = 0, limit: int | None = None) -> int:
+        """How many frames :meth:`frames` brings."""
+        rest = max(0, len(self.recording) - start)
+        return rest if limit is None else min(rest, limit)
+
+    @property
+    def frame_id(self) -> str:
+        """``header.frame_id`` of the images."""
+        return self.recording.frame_id if isinstance(self.recording, BagReader) else "camera"
+
+    def truth_rows(self) -> dict[int, NDArray[np.float64]]:
+        """Stamp -> true pose row (7,), empty when unknown."""
+        if isinstance(self.recording, BagReader):
+            return self.recording.truth_rows()
+        return {stamp: lie.row_from_matrix(T) for stamp, T in self.recording.truth().items()}
+
+
+def _attempts(bag: BagReader, masks: bool) -> Iterator[Frame | FrameError]:
+    """The frames of a bag; one that cannot be decoded does not end the stream."""
+    for packet in bag.packets():
+        kind = f"sensor_msgs/msg/{'CompressedImage' if packet.compressed else 'Image'}"
+        try:
+            rgb = decode_image(deserialize(packet.image, kind, bag.path))
+            yield Frame(packet.stamp_ns, rgb, bag.camera, _mask_of(packet, bag) if masks else None)
+        except FrameError as error:
+            yield error
+
+
+def _masks(bag: BagReader) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+    """Stamps and masks of a bag; one that cannot be decoded says nothing."""
+    for packet in bag.packets():
+        mask = None
+        with suppress(FrameError):
+            mask = _mask_of(packet, bag)
+        yield packet.stamp_ns, mask
+
+
+def _mask_of(packet: Packet, bag: BagReader) -> NDArray[np.uint8] | None:
+    return packet.mask and decode_mask(deserialize(packet.mask, "sensor_msgs/msg/Image", bag.path))
+
+
+def open_source(path: str | Path, detections: Path | None = None) -> Source:
+    """Open a bag or a folder of the ``sequence`` layout, and the CAD model beside it; see :meth:`SourceSpec.open`."""
+    path = Path(path)
+    if not path.exists():
+        raise UsageError(f"recording {path}: no such file or folder")
+    if (path / "labels.json").is_file():
+        recording = load_sequence(path)
+        return _source_of_images(path, recording if detections is None else with_detections(recording, detections))
+    if path.suffix != ".mcap" and not (path / "metadata.yaml").is_file():
+        raise UsageError(f"recording {path}: neither a bag (metadata.yaml) nor a sequence folder (labels.json)")
+    if detections is not None:
+        raise UsageError(f"recording {path}: a bag has its detections in it; give --detections to `hat import`")
+    bag = BagReader(path)
+    if bag.target_path is None:
+        raise BagError(f"{path} has no target.yaml: put the CAD model and a target.yaml that names it into the folder")
+    return Source(path, bag, load_target(bag.target_path))
+
+
+def _source_of_images(path: Path, recording: ImageRecording) -> Source:
+    return Source(path, recording, load_target(recording.target_path, recording.unit_scale))

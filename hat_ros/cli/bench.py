@@ -1,0 +1,260 @@
+"""``hat bench`` and ``hat ablate``: tables over many runs."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hat_ros.cli.options import Commands, add_config, add_dataset, natural, positive
+from hat_ros.cli.run import MODES
+
+if TYPE_CHECKING:
+    from hat_ros.bench.source import SourceSpec
+
+
+def add_commands(commands: Commands) -> None:
+    """Register this group."""
+    _add_bench(commands)
+    _add_ablate(commands)
+
+
+def _add_run_matrix(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "recordings",
+        nargs="*",
+        metavar="SEQ",
+        help="bag or sequence folder, * allowed; SEQ@key=value[,key=value] gives these clips settings of their own",
+    )
+    add_dataset(parser)
+    parser.add_argument("--root", type=Path, metavar="DIR", help="root folder of the --dataset; no bags are written")
+    parser.add_argument("--sequence", action="append", default=[], metavar="NAME", help="only this one (repeatable)")
+    parser.add_argument(
+        "--suite", type=Path, metavar="DIR", help="all clips that `hat synth suite --out DIR` wrote, with its settings"
+    )
+    parser.add_argument(
+        "--out", required=True, type=Path, metavar="DIR", help="folder of the runs; resumed if it exists"
+    )
+    add_config(parser)
+    parser.add_argument("--limit", type=positive, metavar="N", help="at most N frames per run")
+    parser.add_argument("--jobs", type=positive, default=1, metavar="N", help="runs at a time (default: 1)")
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="run on the workers of this Dask scheduler instead (extra `cluster`; shared file system)",
+    )
+
+
+def _clips(arguments: argparse.Namespace) -> list[tuple[SourceSpec, tuple[str, ...]]]:
+    """The recordings that the arguments name."""
+    from hat_ros.bench.experiments.comparison import clips_named, clips_of_dataset, clips_of_suite
+    from hat_ros.errors import UsageError
+
+    if bool(arguments.dataset) != (arguments.root is not None):
+        raise UsageError("--dataset and --root belong together: name the layout and the folder of the data set")
+    if arguments.detections is not None and not arguments.dataset:
+        raise UsageError("--detections belong to the --dataset; import a clip with its own (`hat import --detections`)")
+    clips = clips_named(arguments.recordings)
+    if arguments.suite is not None:
+        clips += clips_of_suite(arguments.suite)
+    if arguments.dataset:
+        clips += clips_of_dataset(
+            arguments.dataset, arguments.root, arguments.model, arguments.sequence, arguments.detections
+        )
+    if not clips:
+        raise UsageError("nothing to run: name bags or sequence folders, a --suite, or a --dataset and its --root")
+    return clips
+
+
+def _names(*known: str) -> argparse.Action:
+    def parse(text: str) -> list[str]:
+        names = [name.strip() for name in text.split(",") if name.strip()]
+        wrong = [name for name in names if name not in known]
+        if wrong or not names:
+            raise argparse.ArgumentTypeError(f"choose from {', '.join(known)}, separated by commas; found '{text}'")
+        return list(dict.fromkeys(names))
+
+    return parse
+
+
+def _method_file(text: str) -> tuple[str, str]:
+    name, separator, pattern = text.partition("=")
+    if not name or not separator or not pattern or "/" in name:
+        raise argparse.ArgumentTypeError(f"expected NAME=FILE, found '{text}'")
+    return name, pattern
+
+
+def _numbers(text: str) -> list[int]:
+    return list(dict.fromkeys(natural(item) for item in text.split(",")))
+
+
+_BENCH_COLUMNS = """\
+columns:
+  E_p, E_t, E_q, SD   pose, translation and rotation error: mean and sample standard deviation over scored frames
+  >90                 share of scored frames more than 90 degrees off
+  cover               share of frames with truth that got a pose
+  best<15, best<30    keyframes where the best of the K candidates is within 15 and 30 degrees
+  IoU, IoU>.9         overlap of detected and recorded mask: mean, share of frames at 0.9 or better
+  rel deg             median rotation error of the motion estimate from frame to frame
+  untrue              share of the frames more than 30 degrees off that call themselves TRACKING
+  in 95%              share of frames whose truth lies inside the stated 95 % ellipsoid
+  fps, p50, p99       frames per second with decoding, latency without; the first ten frames are left out
+  cpu ms              processor time per frame without decoding
+  MiB, +MiB           peak memory, and its growth from the first to the last quarter of the run
+  run                 result folder of the run, below --out
+"""
+
+
+def _add_bench(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "bench",
+        help="clips x methods x masks x starts in one table",
+        description="Run methods over clips, each run in a process of its own with one numerical thread, and write\n"
+        "one table as text, CSV, LaTeX, JSON and PNG. Runs that are done already, with the same inputs,\n"
+        "configuration and code, are used again.",
+        epilog=_BENCH_COLUMNS,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    _add_run_matrix(parser)
+    parser.add_argument(
+        "--modes",
+        type=_names(*MODES, "graph"),
+        metavar="LIST",
+        help=f"methods, from {','.join(MODES)} and graph (bags through ROS) (default: hat,independent, unless there is "
+        "a --method)",
+    )
+    parser.add_argument(
+        "--method",
+        dest="methods",
+        action="append",
+        default=[],
+        metavar="NAME=MODE[:CONFIG][,KEY=VALUE]",
+        help="a method under a name and with a configuration of its own, e.g. Mega-HAT=hat:mega_hat or "
+        "MegaPose=independent:mega_hat (repeatable)",
+    )
+    parser.add_argument(
+        "--masks",
+        type=_names("own", "given"),
+        default=["own"],
+        metavar="LIST",
+        help="own: the preset's segmentation; given: the recording's masks (default: own)",
+    )
+    parser.add_argument(
+        "--start",
+        type=_numbers,
+        default=[0],
+        metavar="LIST",
+        help="cold starts at these frames, e.g. 0,60,120 (default: 0)",
+    )
+    parser.add_argument(
+        "--poses",
+        type=_method_file,
+        action="append",
+        default=[],
+        metavar="NAME=FILE",
+        help="a row for a method that is not ours, from its file of poses (see `hat score`); {clip} in FILE stands for "
+        "the clip's name (repeatable)",
+    )
+    parser.add_argument("--stages", action="store_true", help="print the time per stage as well")
+    parser.set_defaults(command=_bench)
+
+
+def _bench(arguments: argparse.Namespace) -> int:
+    from hat_ros.bench.evaluation.figures import image_bytes
+    from hat_ros.bench.experiments import comparison
+    from hat_ros.bench.experiments.comparison_figure import bench_figure
+    from hat_ros.bench.experiments.run_matrix import run_jobs
+    from hat_ros.cli.console import matrix_progress
+
+    methods = [comparison.Entry.parse(text, arguments.config) for text in arguments.methods]
+    jobs = comparison.bench_jobs(
+        _clips(arguments),
+        arguments.modes or ([] if methods else ["hat", "independent"]),
+        arguments.masks,
+        arguments.start,
+        arguments.config,
+        arguments.overrides,
+        arguments.limit,
+        dict(arguments.poses),
+        methods,
+    )
+    out = arguments.out.resolve()
+    with matrix_progress(len(jobs)) as watch:
+        outcomes = run_jobs(jobs, out, arguments.jobs, arguments.scheduler, watch)
+    table, stages, groups = (
+        comparison.bench_table(outcomes),
+        comparison.stage_table(outcomes),
+        comparison.group_table(outcomes),
+    )
+    for name, written in (("table", table), ("stages", stages), ("groups", groups)):
+        written.write(out, name)
+    for form in ("png", "svg"):
+        (out / f"bench.{form}").write_bytes(image_bytes(bench_figure(table.rows), form))
+        if groups.rows:
+            (out / f"groups.{form}").write_bytes(image_bytes(bench_figure(groups.rows, "group"), form))
+    print(table.text())
+    print(groups.text())
+    if arguments.stages:
+        print(stages.text())
+    failures = comparison.failures(outcomes)
+    for line in failures:
+        print(f"failed: {line}", file=sys.stderr)
+    return 1 if failures else 0
+
+
+_ABLATE_TABLES = """\
+tables, each as NAME.txt, .csv, .tex, .json, .png and .svg below --out:
+  components    what each part of the method adds, row by row
+  sensitivity   anchor stride, K, s0, D, w: one setting at a time
+  selectors     best appearance, the decoder, the offline backtrace, and a particle filter and a UKF at their best
+  filters       the search for that best
+  offline       independent, causal and offline poses from the same observations
+  by_clip       the same, E_p clip by clip
+  masks         motion from the masked target and from raw frames
+  candidates    best of the K candidates of every image, clip by clip (no figure)
+  ranges        errors of the best appearance by range
+trace.json names the runs behind every table and the settings behind every row.
+"""
+
+
+def _add_ablate(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "ablate",
+        help="component table, sensitivity sweeps, filters, offline reference",
+        description="Run the front ends once per clip, then Stages 3 and 4 over what they saw under every setting of "
+        "the paper's ablations. --config decides the temporal settings; --front-end, if given, takes segmentation, "
+        "hypotheses and motion (and what belongs to its scores) from another preset.",
+        epilog=_ABLATE_TABLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    _add_run_matrix(parser)
+    parser.add_argument("--front-end", metavar="NAME|FILE", help="preset of the front ends (default: that of --config)")
+    parser.set_defaults(command=_ablate)
+
+
+def _ablate(arguments: argparse.Namespace) -> int:
+    from hat_ros.bench.evaluation.figures import image_bytes
+    from hat_ros.bench.experiments import ablation
+    from hat_ros.bench.experiments.ablation_figure import table_figure
+    from hat_ros.bench.experiments.run_matrix import run_jobs
+    from hat_ros.cli.console import matrix_progress
+    from hat_ros.io.results import write_json
+
+    out = arguments.out.resolve()
+    plan = ablation.plan(
+        _clips(arguments), out, arguments.config, arguments.front_end, arguments.overrides, arguments.limit
+    )
+    with matrix_progress(len(plan.jobs)) as watch:
+        outcomes = run_jobs(plan.jobs, out, arguments.jobs, arguments.scheduler, watch)
+    for name, table in ablation.tables(plan, outcomes).items():
+        table.write(out, name)
+        for form in ("png", "svg"):
+            if (figure := table_figure(table)) is not None:
+                (out / f"{name}.{form}").write_bytes(image_bytes(figure, form))
+        print(table.text())
+    write_json(out / "trace.json", ablation.trace(plan, outcomes))
+    failed = [f"{outcome.job.name}: {outcome.failure}" for outcome in outcomes if outcome.figures is None]
+    for line in failed:
+        print(f"failed: {line}", file=sys.stderr)
+    return 1 if failed else 0

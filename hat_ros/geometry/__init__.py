@@ -1,0 +1,1 @@
+"""Rotations, rigid motions and similarities, and the small compiled algebra of the inner loops."""

@@ -1,0 +1,1 @@
+"""Between memory and the outside: messages, topics, image encodings, bags and result folders; no middleware."""

@@ -1,0 +1,98 @@
+"""What waits before the graph: images, their masks and the calibration, until the next frame may be admitted."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+from hat_ros.core.sync import Admission
+from hat_ros.errors import FrameError
+from hat_ros.io import messages
+from hat_ros.io.images import decode_image, decode_mask
+from hat_ros.types import Camera, Frame
+
+_MASKS_KEPT = 64
+
+
+class Entrance:
+    """Puts frames together and refuses those that may not enter.
+
+    Args:
+        live: keep only the newest image and count those that it replaces; otherwise all wait their turn.
+        with_masks: a frame is complete only with its mask message (an empty one says "no detection").
+
+    Attributes:
+        camera: the calibration in force, None before the first one.
+        dropped_total: images that were replaced, lost by the middleware, or refused.
+    """
+
+    def __init__(self, live: bool, with_masks: bool) -> None:
+        self._live = live
+        self._images: deque[tuple[int, Any]] = deque()
+        self._masks: dict[int, Any] | None = {} if with_masks else None
+        self._last_number: dict[str, int] = {}
+        self.camera: Camera | None = None
+        self.dropped_total = 0
+
+    def __len__(self) -> int:
+        """Images that wait."""
+        return len(self._images)
+
+    def add_image(self, topic: str, message: Any, number: int | None) -> None:
+        """Queue an image.
+
+        Args:
+            topic: where it came from.
+            message: Image or CompressedImage.
+            number: the publisher's sequence number if the middleware tells it. With a queue of one, DDS overwrites an
+                image that nobody has taken yet; only the gap in the numbers shows it.
+        """
+        if number is not None:
+            self.dropped_total += max(0, number - self._last_number.get(topic, number - 1) - 1)
+            self._last_number[topic] = number
+        if self._live and self._images:
+            self._images.clear()
+            self.dropped_total += 1
+        self._images.append((messages.stamp_of(message), message))
+
+    def add_mask(self, message: Any) -> None:
+        """Keep a mask for its image."""
+        self._masks[messages.stamp_of(message)] = message
+        while len(self._masks) > _MASKS_KEPT:
+            del self._masks[min(self._masks)]
+
+    def set_camera(self, camera: Camera) -> bool:
+        """Take over a calibration; whether it replaces a different one.
+
+        Raises:
+            FrameError: it does, in a replay: a run has one calibration.
+        """
+        if messages.same_camera(camera, self.camera):
+            return False
+        replaces = self.camera is not None
+        if replaces and not self._live:
+            raise FrameError("camera_info changes during the run: split the recording, or start a new run")
+        self.camera = camera
+        return replaces
+
+    def next_frame(self, admission: Admission) -> tuple[Frame, str] | None:
+        """The next frame that may enter, and its ``frame_id``; None while there is none that is complete.
+
+        Raises:
+            FrameError: the next image may not enter: its stamp, encoding or size. It is gone and counted.
+        """
+        if not self._images or self.camera is None:
+            return None
+        stamp_ns, message = self._images[0]
+        try:
+            admission.check(stamp_ns)
+            if self._masks is not None and stamp_ns not in self._masks:
+                return None
+            mask = None if self._masks is None else decode_mask(self._masks.pop(stamp_ns))
+            frame = Frame(stamp_ns, decode_image(message), self.camera, mask)
+        except FrameError as error:
+            self._images.popleft()
+            self.dropped_total += 1
+            raise FrameError(f"frame {stamp_ns} refused: {error}") from None
+        self._images.popleft()
+        return frame, message.header.frame_id

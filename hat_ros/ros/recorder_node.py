@@ -1,0 +1,74 @@
+"""Records what the graph says, images excepted, as it came over the wire. Bag time is the exposure stamp."""
+
+from __future__ import annotations
+
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any, ClassVar
+
+from hat_ros.errors import ConfigError
+from hat_ros.io import topics
+from hat_ros.io.bag import BagWriter, stamp_of_cdr
+from hat_ros.ros import base, process, qos
+
+
+class RecorderNode(base.HatNode):
+    """Writes every topic of :data:`~hat_ros.io.topics.RECORDED` into a bag.
+
+    Attributes:
+        counts: messages recorded by topic.
+        newest_ns: stamp of the last message by topic.
+        span_ns: stamps of the first and last admitted frame; nothing lies between (0, -1).
+        writer: the result bag, open until :meth:`release`.
+    """
+
+    NAME = "recorder"
+    GOES_ON_LIVE = False
+    EXTRA_PARAMETERS: ClassVar = {"out": ("", "folder of the bag to write")}
+    writer: BagWriter | None = None
+
+    def configure(self) -> None:
+        """Open the bag and subscribe."""
+        out = self.settings.extra["out"]
+        if not out:
+            raise ConfigError("parameter 'out' is empty: give the folder of the bag to write, -p out:=FOLDER")
+        self.counts = dict.fromkeys(topics.RECORDED, 0)
+        self.newest_ns = dict.fromkeys(topics.RECORDED, 0)
+        self.span_ns = (0, -1)
+        self.writer = BagWriter(Path(out))
+        for topic in topics.RECORDED:
+            profile = qos.RECORDER_LATCH if qos.is_latched(topic) else qos.RECORDER
+            self.input(topic, partial(self._on_message, topic), profile=profile, raw=True)
+
+    def cleanup(self) -> None:
+        """Close the bag."""
+        self.release()
+
+    def release(self) -> None:
+        """Close the bag; it is complete and readable afterwards."""
+        if self.writer is not None:
+            self.writer.close()
+
+    def values(self) -> dict[str, Any]:
+        """Figures for diagnostics."""
+        return dict(self.counts) if self.writer is not None else {}
+
+    def _on_message(self, topic: str, data: bytes) -> None:
+        # Diagnostics carry the wall clock; in the bag they stand beside the frame that they were said at.
+        clocked = topic == topics.DIAGNOSTICS
+        stamp_ns = self.newest_ns[topics.ADMISSION] if clocked else stamp_of_cdr(data, self.writer.path)
+        self.writer.write_cdr(topic, topics.TYPES[topic], data, stamp_ns)
+        self.counts[topic] += 1
+        if topic == topics.ADMISSION:
+            self.span_ns = (self.span_ns[0] if self.counts[topic] > 1 else stamp_ns, stamp_ns)
+        self.newest_ns[topic] = max(self.newest_ns[topic], stamp_ns)
+
+
+def main() -> int:
+    """Console script."""
+    return process.main([RecorderNode])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

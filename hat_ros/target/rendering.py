@@ -1,0 +1,73 @@
+"""Rendering the CAD model at a pose: one small protocol, two implementations.
+
+Pixel centres lie at integer coordinates (OpenCV): pixel (u, v) sees exactly the ray ``K^-1 [u, v, 1]``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import import_module
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hat_ros.errors import ConfigError
+from hat_ros.target.model import Target
+from hat_ros.types import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class Rendering:
+    """What a camera sees of the target, pixel by pixel.
+
+    Attributes:
+        depth_m: (H, W) float32 distance along the optical axis, 0 = miss.
+        normal_cam: (H, W, 3) float32 unit normal of the face in the camera frame, towards the camera; 0 = miss.
+        face_id: (H, W) int32 index into ``Target.faces``, -1 = miss.
+        rgb: (H, W, 3) uint8 sRGB albedo without any shading, 0 = miss.
+    """
+
+    depth_m: NDArray[np.float32]
+    normal_cam: NDArray[np.float32]
+    face_id: NDArray[np.int32]
+    rgb: NDArray[np.uint8]
+
+    @cached_property
+    def mask(self) -> NDArray[np.bool_]:
+        """(H, W) silhouette."""
+        return self.face_id >= 0
+
+
+class Renderer(Protocol):
+    """A renderer of one target. Constructed as ``Backend(target: Target)``."""
+
+    def render(self, T_cam_target: NDArray[np.float64], camera: Camera, color: bool = True) -> Rendering:
+        """Render the target.
+
+        Args:
+            T_cam_target: (4, 4) pose.
+            camera: intrinsics and image size; use ``camera.crop`` to render a part only.
+            color: False leaves ``rgb`` black, which saves the texture look-ups.
+        """
+        ...
+
+
+RENDERERS = {
+    "embree": "hat_ros.target.embree:EmbreeRenderer",
+    "pyrender": "hat_ros.target.pyrender:PyrenderRenderer",
+}
+
+
+def create_renderer(name: str, target: Target) -> Renderer:
+    """Build a renderer: ``embree`` (no GL, deterministic) or ``pyrender`` (EGL, extra ``gl``).
+
+    Raises:
+        ConfigError: unknown name.
+        MissingDependencyError: the renderer's package or an EGL driver is missing.
+    """
+    if name not in RENDERERS:
+        raise ConfigError(f"renderer: unknown name '{name}', known are {', '.join(sorted(RENDERERS))}")
+    module_name, class_name = RENDERERS[name].split(":")
+    return getattr(import_module(module_name), class_name)(target)

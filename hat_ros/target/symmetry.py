@@ -1,0 +1,81 @@
+"""Turns that hardly change a target's silhouettes: orientations that a mask alone cannot tell apart.
+
+A body with two or four equal sides is often asymmetric in details only, an antenna or a colour. A search by shape finds
+its two orientations together or not at all, and a pose of the past finds only its own.
+"""
+
+from __future__ import annotations
+
+from itertools import permutations, product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hat_ros.cache import cached_arrays
+from hat_ros.geometry import lie
+from hat_ros.hypotheses.bank import view_rotations
+from hat_ros.segmentation.masks import overlap
+from hat_ros.target.embree import EmbreeRenderer
+from hat_ros.target.model import Target
+from hat_ros.types import Camera
+
+_FORMAT = 1
+_SIDE_PX = 64
+_DISTANCE_RADII = 6.0
+# Mean overlap of silhouettes from so many sides, and the most turns that are kept.
+_N_VIEWS = 12
+_MIN_OVERLAP = 0.85
+_MAX_TURNS = 3
+# Turns closer than this to none, or to one another, are the same.
+_SEPARATION_DEG = 15.0
+
+
+def load_or_find_symmetries(target: Target) -> NDArray[np.float64]:
+    """:func:`near_symmetries` from the cache folder, found and stored there when it is absent or damaged."""
+    key = f"{target.sha256}:{_FORMAT}:{_SIDE_PX}:{_DISTANCE_RADII}:{_N_VIEWS}:{_MIN_OVERLAP}:{_MAX_TURNS}"
+    return cached_arrays("near-symmetries", key, lambda: {"turns": near_symmetries(target)})["turns"]
+
+
+def near_symmetries(target: Target) -> NDArray[np.float64]:
+    """(S, 3, 3) rotations of the target about its centre, those that change its silhouettes least first.
+
+    Quarter, third and half turns about the axes of the file and about the principal axes of the surface.
+    """
+    renderer = EmbreeRenderer(target)
+    focal = 0.47 * _SIDE_PX * np.sqrt(_DISTANCE_RADII**2 - 1.0)
+    middle = (_SIDE_PX - 1) / 2
+    camera = Camera(np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]]), _SIDE_PX, _SIDE_PX)
+    position = np.array([0.0, 0.0, _DISTANCE_RADII * target.bounding_radius_m])
+
+    def silhouettes(turn: NDArray[np.float64]) -> list[NDArray[np.uint8]]:
+        poses = (lie.transform(R @ turn, position - R @ turn @ target.center_m) for R in view_rotations(_N_VIEWS))
+        return [renderer.outlined(T, camera).view(np.uint8) for T in poses]
+
+    as_it_is = silhouettes(np.eye(3))
+    turns = _turns(target)
+    alike = np.array([np.mean([overlap(a, b) for a, b in zip(as_it_is, silhouettes(t), strict=True)]) for t in turns])
+    order = np.argsort(-alike, kind="stable")
+    return turns[order[alike[order] >= _MIN_OVERLAP][:_MAX_TURNS]]
+
+
+def turned(T_cam_target: NDArray[np.float64], turn: NDArray[np.float64], center_m: NDArray[np.float64]) -> NDArray:
+    """A pose (4, 4) with the target turned (3, 3) about a point of its own (3,)."""
+    R = T_cam_target[:3, :3]
+    return lie.transform(R @ turn, T_cam_target[:3, 3] + R @ (center_m - turn @ center_m))
+
+
+def _turns(target: Target) -> NDArray[np.float64]:
+    """(N, 3, 3) the turns of a cube, but for none, about both sets of axes."""
+    corners = target.vertices_m[target.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    _, axes = np.linalg.eigh(np.cov(corners.reshape(-1, 3).T, aweights=np.repeat(area, 3)))
+    kept = [np.eye(3)]
+    for about in (np.eye(3), axes):
+        for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+            cube = np.zeros((3, 3))
+            cube[range(3), order] = signs
+            turn = about @ cube @ about.T
+            far = np.degrees(lie.angle_between(np.stack(kept), turn)).min() > _SEPARATION_DEG
+            if np.linalg.det(cube) > 0 and far:
+                kept.append(turn)
+    return np.stack(kept[1:])

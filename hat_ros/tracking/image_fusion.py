@@ -1,0 +1,314 @@
+"""Stage 4 with an eye on the image: every output is refined where it is, causally. Our extension of the paper.
+
+The paper refines offline and lets SLAM and anchors alone carry the causal pose. Here each frame's prediction (relative
+motion applied to the previous output) is refined on that frame's own image, and an accepted refinement is a measurement
+like an anchor: it becomes the output, and with it the previous output of the next frame. What the image does not show
+of the rotation stays as predicted, as far as the predictions of late deserve it (``core.attitude``).
+
+At keyframes the selected anchor competes with the track:
+
+* Within D of the track it is one basin, and the anchor one more start for the refinement: the best result wins.
+* Beyond D it is a rival. Successive rivals that follow from each other (the paper's coherence) add up, and so does
+  their lead in image evidence over the track. A rival takes over once it is supported, leads by ``arbitration_margin``
+  and is the decoder's clear choice, if anchors stood for the track; or once more coherent rivals stand against the
+  track than anchors clearly stood for it, the first one included (``reset_anchors`` at most, as in the paper), unless
+  the image speaks against them by that margin.
+
+With no refinement supported, the output is what the paper's fusion makes of prediction and anchor, and it coasts. A
+supported output is called TRACKING only if it is beyond doubt as well (``core.confidence``): the image is certain, or a
+second anchor came out close to where the track expected it, or the decoder's lead is large; some image so far was
+explained well, or three anchors came out close; and no two anchors in a row have disagreed since.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+
+from hat_ros.config import HatConfig, RefinementConfig
+from hat_ros.core.alignment import SlamAlignment
+from hat_ros.core.cadence import Cadence
+from hat_ros.core.published_fusion import Dissent, Fused, fuse_two, relative_motion
+from hat_ros.core.uncertainty import widened
+from hat_ros.geometry import lie
+from hat_ros.tracking.attitude import AttitudeFilter
+from hat_ros.tracking.prior import extrapolate
+from hat_ros.tracking.refiner import Refiner
+from hat_ros.types import Detection, Float, Frame, Motion, Refined, RotationPrior
+
+# An anchor further from where the track expected it than this share of D shares its basin, but bears no witness to it.
+_CLOSE_SHARE = 0.5
+# A wrong pose hardly ever explains an image well, and its lead among other poor ones says little: a track with evidence
+# that never came this far needs so many agreeing anchors, since masks err alike at successive keyframes.
+_EXPLAINED_QUALITY, _WITNESSES = 0.83, 3
+# So many frames left out in a row carry a target out of its basin: what vouched for the track before is void.
+_INTERRUPTION_FRAMES = 5
+# Measured outputs behind the constant-rate prediction.
+_RATE_HISTORY = 6
+
+
+class RefinedFusion:
+    """Track, anchors and image evidence, frame by frame.
+
+    Attributes:
+        alignment: the Sim(3), fitted to measured outputs at keyframes.
+    """
+
+    def __init__(self, config: HatConfig, refiner: Refiner) -> None:
+        self._fusion, self._refinement = config.fusion, config.refinement
+        self._alignment_config = config.alignment
+        self._refiner = refiner
+        self.alignment = SlamAlignment(config.alignment)
+        self._dissent = Dissent(config.fusion.gate_angle_deg, config.alignment.reset_anchors)
+        self._attitude = AttitudeFilter(np.radians(config.refinement.start_sigma_deg))
+        self._cadence = Cadence()
+        self._lead = 0.0
+        self._epoch = 0
+        self.lose()
+
+    def lose(self) -> None:
+        """Give the track up: the next supported anchor starts afresh."""
+        self._output: tuple[Float, Motion] | None = None
+        self._start_track()
+        self._measured: deque[tuple[int, Float]] = deque(maxlen=_RATE_HISTORY)
+        self._just_measured = False
+
+    def _start_track(self) -> None:
+        """Nobody has spoken for or against the track yet, and nothing is known of its predictions."""
+        self._attitude.forget()
+        self._held: Refined | None = None
+        self._best_quality = 0.0
+        self._founded = False  # by an anchor that was the decoder's clear choice
+        self._n_agreed = 0  # such anchors since
+        self._n_disagreed = 0
+        self._forget_rivals()
+
+    def update(
+        self,
+        frame: Frame,
+        detection: Detection | None,
+        motion: Motion,
+        anchor: Float | None,
+        confidence: float,
+        decided: bool,
+    ) -> Fused:
+        """Advance by one frame; arguments as :meth:`CausalFusion.update`, beside the image.
+
+        ``decided``: the decoder prefers the anchor's basin clearly. An anchor that barely won speaks for no track, nor
+        does it alone overthrow one.
+        """
+        if motion.epoch != self._epoch:
+            self._epoch = motion.epoch
+            self.alignment.reset()
+        if self._cadence.missed(frame.stamp_ns) >= _INTERRUPTION_FRAMES:
+            self._start_track()
+        predictions = self._predictions(frame.stamp_ns, motion)
+        fused = self._decide(frame, detection, predictions, anchor, confidence, decided)
+        if fused.reset:
+            self.alignment.reset()
+        if fused.measurement is not None:
+            if self._jumps(fused):
+                self._measured.clear()
+            self._measured.append((frame.stamp_ns, fused.measurement))
+            if anchor is not None and motion.valid:
+                self.alignment.observe(fused.measurement, motion.T_slam_cam)
+        self._just_measured = fused.measurement is not None
+        self.alignment.update(motion.epoch)
+        self._output = None if fused.T_cam_target is None else (fused.T_cam_target, motion)
+        return fused
+
+    def _decide(
+        self,
+        frame: Frame,
+        detection: Detection | None,
+        predictions: list[Float],
+        anchor: Float | None,
+        confidence: float,
+        decided: bool,
+    ) -> Fused:
+        if not predictions:
+            return self._start(frame, detection, anchor, decided)
+        predicted = predictions[0]
+        self._held = self._refiner.refine(frame, detection, predicted, self._known_of(predicted))
+        track = self._best_refined(frame, detection, predictions[1:], self._held, self._refinement.switch_margin)
+        if anchor is None:
+            return self._outcome(track, predicted, predicted)
+        reference = track.T_cam_target if is_supported(track, self._refinement) else predicted
+        if not self._dissent.update(anchor, reference):
+            self._forget_rivals()
+            apart_rad = lie.angle_between(anchor[:3, :3], predicted[:3, :3])
+            close = apart_rad <= np.radians(_CLOSE_SHARE * self._fusion.gate_angle_deg)
+            self._n_agreed = self._n_agreed + decided if close else 0
+            self._n_disagreed = 0
+            return self._agree(frame, detection, track, predicted, anchor, confidence)
+        return self._arbitrate(frame, detection, track, predicted, anchor, decided)
+
+    def _known_of(self, predicted: Float) -> RotationPrior:
+        """What the track says of its rotation now."""
+        output, _ = self._output
+        return RotationPrior(predicted[:3, :3], self._attitude.predict(predicted[:3, :3] @ output[:3, :3].T))
+
+    def _start(self, frame: Frame, detection: Detection | None, anchor: Float | None, decided: bool) -> Fused:
+        """Without a track the anchor starts one; unless the image supports it, it only coasts."""
+        if anchor is None:
+            return Fused(None)
+        self._founded = decided
+        refined = self._best_refined(frame, detection, [anchor])
+        return replace(self._outcome(refined, anchor, None), gate_weight=1.0)
+
+    def _agree(
+        self,
+        frame: Frame,
+        detection: Detection | None,
+        track: Refined | None,
+        predicted: Float,
+        anchor: Float,
+        confidence: float,
+    ) -> Fused:
+        """Anchor and track share a basin: the better refinement; unsupported, the paper's fusion of the two.
+
+        An unsupported anchor with less evidence than the track does not pull at it.
+        """
+        best = self._best_refined(frame, detection, [anchor], track)
+        otherwise = predicted
+        if track is None or best is not track:
+            otherwise = fuse_two(anchor, confidence, predicted, self._fusion, self._alignment_config.lever_m_per_rad)
+        return replace(self._outcome(best, otherwise, predicted), gate_weight=1.0)
+
+    def _arbitrate(
+        self,
+        frame: Frame,
+        detection: Detection | None,
+        track: Refined | None,
+        predicted: Float,
+        anchor: Float,
+        decided: bool,
+    ) -> Fused:
+        """Anchor and track stand in different basins: weigh the evidence so far.
+
+        Against a track that others have spoken for, one anchor that barely won is not enough, however much the mask,
+        which both were compared with, prefers it. Anchors that agree on what no image has ever supported say nothing.
+        """
+        self._n_disagreed += 1
+        rival = self._best_refined(frame, detection, [anchor])
+        lead = quality(rival) - quality(track)
+        self._lead = lead if self._dissent.count == 1 else self._lead + lead
+        n_spoken = self._n_agreed + self._founded if self._best_quality > 0.0 else 0
+        needed = min(n_spoken + 1, self._alignment_config.reset_anchors)
+        margin = self._refinement.arbitration_margin
+        clearly_better = self._lead >= margin and is_supported(rival, self._refinement)
+        clearly_better &= decided or n_spoken == 0
+        outnumbers = self._dissent.count >= needed and self._lead > -margin
+        if not (clearly_better or outnumbers):
+            return replace(self._outcome(track, predicted, predicted), gate_weight=self._fusion.gate_weight)
+        self._start_track()
+        self._founded = decided
+        return replace(self._outcome(rival, anchor, None), gate_weight=1.0, reset=True)
+
+    def _forget_rivals(self) -> None:
+        self._dissent.clear()
+        self._lead = 0.0
+
+    def _predictions(self, stamp_ns: int, motion: Motion) -> list[Float]:
+        """Where the track should be now, best first; empty without a track.
+
+        How the target turns relative motion knows from its second frame, how far it moves in metres only once it is
+        aligned; until then the constant rate says it.
+        """
+        if self._output is None:
+            return []
+        output, previous = self._output
+        at_rate = self._at_constant_rate(stamp_ns)
+        scale = 0.0 if self.alignment.current is None else self.alignment.current.scale
+        step = relative_motion(previous, motion, scale)
+        if step is None:
+            return [output] if at_rate is None else [at_rate]
+        if self.alignment.n_observations >= self._fusion.warmup_observations and scale > 0.0:
+            position = (step @ output)[:3, 3]
+        else:
+            position = (output if at_rate is None else at_rate)[:3, 3]
+        moved = lie.transform(step[:3, :3] @ output[:3, :3], position)
+        # A rate that no image has confirmed of late is no second opinion.
+        second = at_rate is not None and self._just_measured and not self._same(moved, at_rate)
+        return [moved, at_rate] if second else [moved]
+
+    def _at_constant_rate(self, stamp_ns: int) -> Float | None:
+        """The measured outputs continued; None with fewer than two."""
+        if len(self._measured) < 2:
+            return None
+        stamps, poses = zip(*self._measured, strict=True)
+        return lie.matrix_from_row(extrapolate(np.array(stamps, dtype=np.int64), np.stack(poses), stamp_ns))
+
+    def _best_refined(
+        self,
+        frame: Frame,
+        detection: Detection | None,
+        starts: list[Float],
+        best: Refined | None = None,
+        lead: float = 0.0,
+    ) -> Refined | None:
+        """The refinement with most evidence; a later start must lead by ``lead`` over a supported pose to replace it.
+
+        Starts close to a supported pose are not tried: they would end there.
+        """
+        for start in starts:
+            if is_supported(best, self._refinement) and self._same(start, best.T_cam_target):
+                continue
+            refined = self._refiner.refine(frame, detection, start)
+            if quality(refined) > quality(best) + (lead if is_supported(best, self._refinement) else 0.0):
+                best = refined
+        return best
+
+    def _same(self, T_a: Float, T_b: Float) -> bool:
+        """Whether refinements that start at these poses would end at the same."""
+        apart_rad = lie.angle_between(T_a[:3, :3], T_b[:3, :3])
+        return bool(apart_rad <= np.radians(self._refinement.same_pose_deg))
+
+    def _jumps(self, fused: Fused) -> bool:
+        """The measurement left the pose that the past predicted: earlier poses tell no rate."""
+        if fused.predicted is None:
+            return True
+        apart_rad = lie.angle_between(fused.measurement[:3, :3], fused.predicted[:3, :3])
+        return bool(apart_rad > np.radians(2.0 * self._refinement.same_pose_deg))
+
+    def _outcome(self, refined: Refined | None, otherwise: Float, predicted: Float | None) -> Fused:
+        """A supported refinement as a measurement, which the track learns from, or another pose without one."""
+        if not is_supported(refined, self._refinement):
+            return Fused(otherwise, predicted)
+        T = refined.T_cam_target
+        if refined is self._held:
+            self._attitude.correct(T[:3, :3], predicted[:3, :3], refined.covariance[3:, 3:])
+        else:
+            self._attitude.restart(T[:3, :3], refined.covariance[3:, 3:])
+        self._best_quality = max(self._best_quality, quality(refined))
+        explained = self._best_quality >= _EXPLAINED_QUALITY
+        # An unknown overlap (NaN) is never certain.
+        certain = min(refined.overlap, refined.support) >= self._refinement.certain_share or self._n_agreed > 0
+        return Fused(
+            T,
+            predicted,
+            measurement=T,
+            covariance=widened(refined.covariance, refined.misfit_px, self._basin(T)),
+            confirmed=certain,
+            doubtful=self._n_disagreed > 1 or not (explained or self._n_agreed >= _WITNESSES),
+        )
+
+    def _basin(self, T_cam_target: Float) -> Float:
+        """(6,) sigmas, metres and radians: how far off a refinement in the right basin can be."""
+        shift_m = self._refinement.max_shift * float(np.linalg.norm(T_cam_target[:3, 3]))
+        return np.repeat([shift_m, np.radians(self._fusion.gate_angle_deg)], 3)
+
+
+def is_supported(refined: Refined | None, config: RefinementConfig) -> bool:
+    """Whether the image speaks for a refined pose; without a silhouette mask the contour speaks alone."""
+    if refined is None:
+        return False
+    overlaps = np.isnan(refined.overlap) or refined.overlap >= config.min_overlap
+    return bool(overlaps and refined.support >= config.min_support)
+
+
+def quality(refined: Refined | None) -> float:
+    """Image evidence for a pose, 0 for a refused one."""
+    return 0.0 if refined is None else refined.quality

@@ -1,0 +1,159 @@
+"""Result folders: atomic, readable when stopped, the same from memory and from the bag."""
+
+import csv
+
+import numpy as np
+import pytest
+import yaml
+from scripted import CAMERA, stamp, steps, true_row, truth
+
+from hat_ros.bench.evaluation.pose_tables import write_tables
+from hat_ros.config import HatConfig, config_from_dict
+from hat_ros.errors import BagError, UsageError
+from hat_ros.io.result_bag import ResultBagWriter, read_result_bag
+from hat_ros.io.results import LiveTables, ResultFolder, tum_line, write_config
+from hat_ros.io.run_log import RunLogBuilder
+from hat_ros.types import TrackState
+
+
+@pytest.fixture
+def bag(tmp_path):
+    with ResultBagWriter(tmp_path / "bag", "camera", "target") as writer:
+        for step in steps():
+            writer.write_step(step, 2)
+        writer.write_context(CAMERA, truth(12))
+    return tmp_path / "bag"
+
+
+def in_memory(count=10):
+    builder = RunLogBuilder()
+    for step in steps(count):
+        builder.add(step.candidates, step.motion, step.estimate)
+    builder.dropped_total = 2
+    return builder.build(truth(count))
+
+
+def test_bag_gives_back_every_bit_of_the_run(bag):
+    read, made = read_result_bag(bag), in_memory()
+    for name in vars(made):
+        if name == "candidates":
+            for a, b in zip(read.candidates, made.candidates, strict=True):
+                np.testing.assert_array_equal(a.pose_rows, b.pose_rows)
+                np.testing.assert_array_equal(a.log_score, b.log_score)
+                np.testing.assert_array_equal(a.box_xyxy, b.box_xyxy)
+        else:
+            np.testing.assert_array_equal(getattr(read, name), getattr(made, name), err_msg=name)
+
+
+def test_bag_holds_no_image_and_truth_only_of_the_run(bag):
+    from rosbags.rosbag2 import Reader
+
+    with Reader(bag) as reader:
+        assert not any("Image" in connection.msgtype for connection in reader.connections)
+        counts = {connection.topic: connection.msgcount for connection in reader.connections}
+    assert counts["/ground_truth/target_pose"] == 10
+    assert counts["/hat/status"] == counts["/hat/selection"] == counts["/hat/slam_state"] == 10
+    assert counts["/target_pose"] == 7, "nothing is published while UNINITIALISED or LOST"
+    assert counts["/hat/alignment"] == 1, "only on change"
+
+
+def test_bag_that_was_altered_is_refused(bag):
+    data = bytearray((bag / "bag.mcap").read_bytes())
+    data[len(data) // 2] ^= 1
+    (bag / "bag.mcap").write_bytes(bytes(data))
+    with pytest.raises(BagError, match="SHA-256"):
+        read_result_bag(bag)
+
+
+def test_folder_that_is_no_bag_is_refused(tmp_path):
+    with pytest.raises(BagError, match=r"metadata\.yaml"):
+        read_result_bag(tmp_path)
+
+
+def test_finished_folder_appears_under_its_name(tmp_path):
+    with ResultFolder(tmp_path / "out") as folder:
+        write_config(folder.path, HatConfig())
+        assert folder.path.name == "out.partial"
+        assert not (tmp_path / "out").exists()
+    assert (tmp_path / "out" / "config.yaml").is_file()
+    assert not (tmp_path / "out.partial").exists()
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError])
+def test_stopped_run_keeps_what_was_done_under_partial(tmp_path, error):
+    with pytest.raises(error), ResultFolder(tmp_path / "out") as folder:
+        write_config(folder.path, HatConfig())
+        tables = LiveTables(folder.path, ("latency_ms",))
+        for step in steps(5):
+            tables.add(step.estimate, (1.0,))
+        raise error
+    left = tmp_path / "out.partial"
+    assert not (tmp_path / "out").exists()
+    assert len((left / "poses.tum").read_text().splitlines()) == 4, "lines are flushed one by one"
+    assert len((left / "frames.csv").read_text().splitlines()) == 1 + 5
+
+
+def test_next_run_replaces_the_partial_of_a_stopped_one(tmp_path):
+    with pytest.raises(KeyboardInterrupt), ResultFolder(tmp_path / "out") as folder:
+        write_config(folder.path, HatConfig())
+        raise KeyboardInterrupt
+    with ResultFolder(tmp_path / "out") as folder:
+        assert list(folder.path.iterdir()) == []
+        write_config(folder.path, HatConfig())
+    assert (tmp_path / "out").is_dir()
+
+
+def test_finished_result_is_not_overwritten_unasked(tmp_path):
+    for overwrite in (False, True):
+        if overwrite:
+            with pytest.raises(UsageError, match="--overwrite"):
+                ResultFolder(tmp_path / "out")
+        with ResultFolder(tmp_path / "out", overwrite) as folder:
+            write_config(folder.path, HatConfig())
+
+
+def test_overwrite_never_deletes_what_is_no_result_folder(tmp_path):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "cat.jpg").write_bytes(b"x")
+    with pytest.raises(UsageError, match="not a result folder"):
+        ResultFolder(tmp_path / "photos", overwrite=True)
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(UsageError, match="not a result folder"):
+        ResultFolder(tmp_path / "file", overwrite=True)
+
+
+def test_old_result_stays_until_the_new_one_is_complete(tmp_path):
+    with ResultFolder(tmp_path / "out") as folder:
+        write_config(folder.path, HatConfig())
+        (folder.path / "old").touch()
+    with pytest.raises(KeyboardInterrupt), ResultFolder(tmp_path / "out", overwrite=True):
+        raise KeyboardInterrupt
+    assert (tmp_path / "out" / "old").exists()
+
+
+def test_config_as_used_is_complete_and_reads_back(tmp_path):
+    write_config(tmp_path, HatConfig())
+    assert config_from_dict(yaml.safe_load((tmp_path / "config.yaml").read_text())) == HatConfig()
+
+
+def test_tables(tmp_path):
+    log = in_memory()
+    write_tables(tmp_path, log)
+    rows = list(csv.DictReader((tmp_path / "poses.csv").open()))
+    assert [int(row["stamp_ns"]) for row in rows] == [stamp(i) for i in range(10)]
+    assert rows[0]["state"] == "UNINITIALISED"
+    assert rows[0]["x_m"] == rows[0]["E_p"] == "", "no output has no error, not an error of zero"
+    assert float(rows[3]["E_q_deg"]) == pytest.approx(3.0)
+    assert float(rows[3]["E_t_m"]) == pytest.approx(0.05)
+    assert rows[8]["state"] == TrackState.LOST.name
+    assert rows[8]["qw"] == ""
+    tum = (tmp_path / "poses.tum").read_text().splitlines()
+    assert len(tum) == 7
+    assert tum[0].startswith("1.100000000 ")
+
+
+def test_tum_line_keeps_nanoseconds_and_every_bit():
+    row = true_row(3) / 3.0
+    text = tum_line(1_700_000_000_123_456_789, row).split()
+    assert text[0] == "1700000000.123456789"
+    np.testing.assert_array_equal(np.array(text[1:], dtype=float), row)

@@ -1,0 +1,72 @@
+"""When the output's basin is beyond doubt: laws of core.confidence."""
+
+import numpy as np
+import pytest
+
+from hat_ros.config import RefinementConfig
+from hat_ros.geometry import lie
+from hat_ros.tracking.confidence import BasinConfidence
+from hat_ros.types import Candidates, Selection
+
+CONFIG = RefinementConfig()
+APART_DEG = 30.0
+RIGHT, WRONG = (lie.transform(lie.so3_exp(np.array([0, 0, a])), np.array([0, 0, 5.0])) for a in (0.0, np.pi / 2))
+
+
+def _selection(right, wrong, appearance_right=None):
+    """Path scores of both basins; appearance says the same unless told otherwise."""
+    path = np.array([right, wrong], dtype=float)
+    scaled = path if appearance_right is None else np.array([appearance_right, 0.0])
+    return Selection(
+        Candidates(lie.row_from_matrix(np.stack([RIGHT, WRONG])), path), scaled, path, int(np.argmax(path))
+    )
+
+
+def _after(*selections, output=RIGHT):
+    confidence = BasinConfidence(CONFIG, APART_DEG)
+    for selection in selections:
+        confidence.update(selection, output)
+    return confidence
+
+
+def test_a_clear_lead_of_the_outputs_basin_is_needed():
+    assert _after(_selection(0.0, -CONFIG.min_margin)).vouches(confirmed=True)
+    assert not _after(_selection(0.0, -CONFIG.min_margin + 0.1)).vouches(confirmed=True)
+
+
+def test_a_lead_of_another_basin_speaks_against_the_output():
+    confidence = _after(_selection(0.0, -20.0), output=WRONG)
+    assert confidence.margin == -20.0
+    assert not confidence.vouches(confirmed=True)
+
+
+def test_without_confirmation_only_a_sure_lead_will_do():
+    assert _after(_selection(0.0, -CONFIG.sure_margin)).vouches(confirmed=False)
+    assert not _after(_selection(0.0, -CONFIG.sure_margin + 0.1)).vouches(confirmed=False)
+
+
+def test_appearance_must_agree_with_the_decoder_at_two_keyframes_in_a_row():
+    clear, against = _selection(0.0, -10.0), _selection(0.0, -10.0, appearance_right=-1.0)
+    assert not _after(against).vouches(confirmed=True)
+    assert not _after(against, clear).vouches(confirmed=True)
+    assert _after(against, clear, clear).vouches(confirmed=True)
+
+
+def test_frames_between_keyframes_change_nothing():
+    selection = _selection(0.0, -5.0)
+    before, after = _after(selection), _after(selection, Selection.none(), Selection.none())
+    assert before.margin == after.margin == 5.0
+
+
+def test_a_lead_over_nobody_is_none():
+    alone = Selection(Candidates(lie.row_from_matrix(RIGHT[None]), np.zeros(1)), np.zeros(1), np.zeros(1), 0)
+    assert _after(alone).margin == np.inf
+    assert not _after(alone).vouches(confirmed=False)
+    assert _after(alone).vouches(confirmed=True)
+
+
+@pytest.mark.parametrize("output", [None, RIGHT])
+def test_nothing_is_known_before_the_first_keyframe(output):
+    confidence = _after(Selection.none(), output=output)
+    assert np.isnan(confidence.margin)
+    assert not confidence.vouches(confirmed=False)
