@@ -9,20 +9,20 @@ from __future__ import annotations
 import resource
 import time
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
-from hat_ros.app.scheduler import Turnstiles
-from hat_ros.bench.methods import Method
+from hat_ros.app.scheduler import StageScheduler
 from hat_ros.core.sync import Admission
 from hat_ros.errors import FrameError
-from hat_ros.tracker import Step
-from hat_ros.types import Frame
+from hat_ros.tracker import StageWrapper, Step
+from hat_ros.types import Estimate, Frame
 
 STAGE_NAMES = ("segmentation", "hypotheses", "motion", "selector", "fusion")
 MEASURED = (
@@ -71,18 +71,36 @@ class Processed:
         )
 
 
+class Method(Protocol):
+    """What turns frames into poses."""
+
+    causal: bool
+    """Whether ``step`` gives the final answer; if not, :meth:`finish` does."""
+
+    concurrent: bool
+    """Whether steps of several frames may overlap by the rules of :mod:`hat_ros.app.scheduler`."""
+
+    def step(self, frame: Frame) -> Step:
+        """Process one frame, stamps strictly increasing."""
+        ...
+
+    def finish(self) -> list[Estimate]:
+        """The estimates of all frames, for a method that is not causal; empty otherwise."""
+        ...
+
+
 class Pipeline:
     """Feeds the frames of one run to a method.
 
     Args:
-        method: what estimates the poses.
+        create: builds what estimates the poses, given the wrapper for its stages.
         credits: W, frames in flight at once, each in a thread; the answers do not depend on it.
     """
 
-    def __init__(self, method: Method, credits: int = 1) -> None:
-        self._method = method
-        self._credits = credits if method.concurrent else 1
-        self._turnstiles = Turnstiles(method.stages)
+    def __init__(self, create: Callable[[StageWrapper], Method], credits: int = 1) -> None:
+        self._scheduler = StageScheduler()
+        self._method = create(self._scheduler.wrap)
+        self._credits = credits if self._method.concurrent else 1
         self._admission = Admission(self._credits)
         self.rejected = 0
 
@@ -121,7 +139,7 @@ class Pipeline:
                 if failure is not None:
                     raise failure
             finally:
-                self._turnstiles.close(0)
+                self._scheduler.close(0)
 
     def finish(self, steps: list[Step]) -> list[Step]:
         """The collected steps with the answers of a method that gives them only after the last frame."""
@@ -141,7 +159,7 @@ class Pipeline:
 
     def _process(self, seq: int, frame: Frame, decode_ms: float) -> Processed:
         start = time.perf_counter()
-        with self._turnstiles.frame(seq) as stage_ms:
+        with self._scheduler.frame(seq) as stage_ms:
             step = self._method.step(frame)
         latency_ms = 1e3 * (time.perf_counter() - start)
         stage_ms = {name: stage_ms.get(name, 0.0) for name in STAGE_NAMES}

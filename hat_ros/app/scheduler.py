@@ -1,8 +1,8 @@
 """Several frames inside one method at once, without changing what it computes.
 
-Each frame runs the whole ``step`` of the method in a thread of its own. A turnstile before every stage lets frames
-through one at a time, in frame order, so each stage sees exactly the calls that it would see from a plain loop; while
-one frame is in the motion stage the next can be in the hypotheses. It pays because compiled code, OpenCV and torch
+Each frame runs the whole ``step`` of the method in a thread of its own. Every stage is wrapped so that it is called by
+one frame at a time, in frame order, so each stage sees exactly the calls that it would see from a plain loop; while one
+frame is in the motion stage the next can be in the hypotheses. It pays because compiled code, OpenCV and torch
 release the interpreter lock.
 
 Two rules make that safe. What a step does before its first stage happens in frame order too, and alone. What it does
@@ -15,7 +15,10 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from functools import partial
+from typing import Any, TypeVar, cast
+
+Stage = TypeVar("Stage")
 
 _START = "start"
 
@@ -24,21 +27,22 @@ class Closed(Exception):
     """An earlier frame failed, or nobody waits for the answer any more."""
 
 
-class Turnstiles:
-    """One turnstile per stage.
+class StageScheduler:
+    """Lets frames through the stages of a method one at a time, in order, and times each stage."""
 
-    Args:
-        stages: stage name -> object with an ``update`` that a step calls at most once; it is replaced by one that
-            passes the turnstile and is timed.
-    """
-
-    def __init__(self, stages: dict[str, Any]) -> None:
-        self._next = dict.fromkeys((_START, *stages), 0)
+    def __init__(self) -> None:
+        self._next = {_START: 0}
         self._changed = threading.Condition()
         self._closed_from: float = float("inf")
         self._local = threading.local()
-        for name, stage in stages.items():
-            stage.update = self._guarded(name, stage.update)
+
+    def wrap(self, name: str, stage: Stage) -> Stage:
+        """The stage behind its turn: an object whose ``update``, called at most once per step, waits and is timed.
+
+        A :data:`~hat_ros.tracker.StageWrapper`; to be used before the first frame.
+        """
+        self._next[name] = 0
+        return cast("Stage", _ScheduledStage(stage, partial(self._run, name)))
 
     @contextmanager
     def frame(self, seq: int) -> Iterator[dict[str, float]]:
@@ -63,24 +67,21 @@ class Turnstiles:
             self._leave(name, seq)
 
     def close(self, seq: int) -> None:
-        """Let frame ``seq`` and later ones pass no turnstile any more; earlier ones go on."""
+        """Let frame ``seq`` and later ones pass no stage any more; earlier ones go on."""
         with self._changed:
             self._closed_from = min(self._closed_from, seq)
             self._changed.notify_all()
 
-    def _guarded(self, name: str, update: Callable[..., Any]) -> Callable[..., Any]:
-        def guarded(*args: Any) -> Any:
-            seq, stage_ms = self._local.seq, self._local.stage_ms
-            self._wait(name, seq)
-            self._leave(_START, seq)
-            start = time.perf_counter()
-            try:
-                return update(*args)
-            finally:
-                stage_ms[name] = 1e3 * (time.perf_counter() - start)
-                self._leave(name, seq)
-
-        return guarded
+    def _run(self, name: str, update: Callable[..., Any], *arguments: Any) -> Any:
+        seq, stage_ms = self._local.seq, self._local.stage_ms
+        self._wait(name, seq)
+        self._leave(_START, seq)
+        start = time.perf_counter()
+        try:
+            return update(*arguments)
+        finally:
+            stage_ms[name] = 1e3 * (time.perf_counter() - start)
+            self._leave(name, seq)
 
     def _wait(self, name: str, seq: int) -> None:
         with self._changed:
@@ -93,3 +94,17 @@ class Turnstiles:
             if self._next[name] == seq:
                 self._next[name] = seq + 1
                 self._changed.notify_all()
+
+
+class _ScheduledStage:
+    """A stage whose ``update`` goes through the scheduler; everything else is the stage's own."""
+
+    def __init__(self, stage: Any, run: Callable[..., Any]) -> None:
+        self._stage = stage
+        self._run = run
+
+    def update(self, *arguments: Any) -> Any:
+        return self._run(self._stage.update, *arguments)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stage, name)

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -85,10 +86,9 @@ def track(spec: SourceSpec, out: Path, config: HatConfig, options: TrackOptions,
     source = spec.open()
     if source.count(options.start, options.limit) == 0:
         raise UsageError(f"{spec.path} has {source.count()} frames, --start {options.start} leaves none")
-    method = create_method(options.mode, config, source.target)
     masks_given = config.segmentation.backend in GIVEN_MASK_BACKENDS
     credits = options.credits or min(DEFAULT_CREDITS, config.graph.credits_replay)
-    pipeline = Pipeline(method, credits)
+    pipeline = Pipeline(partial(create_method, options.mode, config, source.target), credits)
     how = {"mode": options.mode, "start": options.start, "limit": options.limit}
     with _result_folder(folder, spec, config, how):
         measured = _run(pipeline, source, folder, options, masks_given, watch)

@@ -18,6 +18,7 @@ from hat_ros.bench.methods.smoothing import solve_offline
 from hat_ros.config import HatConfig
 from hat_ros.core.fusion import FusionStage
 from hat_ros.core.guard import candidates_from_recording, guard_candidates
+from hat_ros.core.published_fusion import PublishedFusion
 from hat_ros.core.selector import SelectorStage
 from hat_ros.errors import CandidateError, InputError
 from hat_ros.geometry import lie
@@ -127,7 +128,7 @@ def run_temporal(observations: Observations, config: HatConfig) -> TemporalResul
     """
     n = len(observations)
     config = replace(config, fusion=replace(config.fusion, coast_limit_frames=n))
-    selector, fusion = SelectorStage(config.selector), FusionStage(config, None)
+    selector, fusion = SelectorStage(config.selector), FusionStage(config, PublishedFusion(config))
     T_cam_target, held = np.full((n, 4, 4), np.nan), np.zeros(n, dtype=bool)
     chosen, accepted, n_resets = np.full(n, -1), np.zeros(n, dtype=bool), np.zeros(n + 1, dtype=int)
     for t in range(n):

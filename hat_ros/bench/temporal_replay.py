@@ -16,6 +16,7 @@ from hat_ros.bench.temporal import Observations
 from hat_ros.config import HatConfig
 from hat_ros.core.fusion import FusionStage
 from hat_ros.core.keyframes import KeyframeSchedule
+from hat_ros.core.published_fusion import PublishedFusion
 from hat_ros.core.selector import SelectorStage, box_area_px
 from hat_ros.geometry import lie
 from hat_ros.io.run_log import RunLog, RunLogBuilder
@@ -58,7 +59,7 @@ def replay_temporal(log: RunLog, config: HatConfig, selector: Selector | None = 
     """
     config = replace(config, fusion=replace(config.fusion, coast_limit_frames=max(1, len(log))))
     selector = selector or SelectorStage(config.selector)
-    fusion = FusionStage(config, None)
+    fusion = FusionStage(config, PublishedFusion(config))
     builder = RunLogBuilder()
     for i, candidates in enumerate(keyframes_of(log, config)):
         motion = log.motion(i)

@@ -10,12 +10,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hat_ros.config import AlignmentConfig, FusionConfig
+from hat_ros.config import FusionConfig, HatConfig
 from hat_ros.core.alignment import SlamAlignment
 from hat_ros.core.inertia import InertialPrior
 from hat_ros.core.pose_solver import PoseProblem, solve_pose
+from hat_ros.core.selector import box_area_px
 from hat_ros.geometry import lie
-from hat_ros.types import Float, Motion
+from hat_ros.types import Detection, Float, Frame, Motion, Selection
 
 
 @dataclass(frozen=True)
@@ -29,9 +30,7 @@ class Fused:
         reset: the alignment was dropped at this frame.
         measurement: (4, 4) what this frame's own image says, None when it says nothing.
         covariance: (6, 6) of the measurement, None when its source does not know.
-        confirmed: the image is certain of the measurement's basin, or an anchor has agreed with it.
-        doubtful: successive anchors stand in another basin than the measurement, or neither images nor anchors have
-            spoken clearly for it yet.
+        certain: the output is to be called TRACKING.
     """
 
     T_cam_target: Float | None
@@ -40,27 +39,47 @@ class Fused:
     reset: bool = False
     measurement: Float | None = None
     covariance: Float | None = None
-    confirmed: bool = False
-    doubtful: bool = False
+    certain: bool = False
 
 
-class CausalFusion:
+class PublishedFusion:
     """Eqs. (alignmentfit) to (causalfusion) over a stream of frames.
 
     Attributes:
         alignment: the Sim(3) and its observations.
     """
 
-    def __init__(self, alignment: AlignmentConfig, fusion: FusionConfig) -> None:
-        self._config = fusion
-        self._lever_m_per_rad = alignment.lever_m_per_rad
-        self.alignment = SlamAlignment(alignment)
-        self._dissent = Dissent(fusion.gate_angle_deg, alignment.reset_anchors)
+    def __init__(self, config: HatConfig) -> None:
+        self._alignment_config, self._config = config.alignment, config.fusion
+        self._lever_m_per_rad = config.alignment.lever_m_per_rad
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the target's state; the next anchor starts afresh."""
+        fusion = self._config
+        self.alignment = SlamAlignment(self._alignment_config)
+        self._area_confidence = AreaConfidence(fusion)
+        self._dissent = Dissent(fusion.gate_angle_deg, self._alignment_config.reset_anchors)
         self._inertia = InertialPrior(fusion.inertial_weight, fusion.relative_weight)
         self._epoch = 0
         self._previous: tuple[Float | None, Motion] = (None, Motion.none())
 
-    def update(self, motion: Motion, anchor: Float | None, confidence: float) -> Fused:
+    def lose(self) -> None:
+        """The output was given up. Nothing to do: alignment and previous output stay valid for the next anchor."""
+
+    def update(self, frame: Frame, detection: Detection | None, motion: Motion, selection: Selection) -> Fused:
+        """Advance by one frame; the image is not looked at. See :class:`~hat_ros.core.fusion.FusionMethod`."""
+        anchor, confidence = selection.anchor, 1.0
+        if anchor is not None:
+            confidence = self._area_confidence.update(box_area_px(selection.candidates.box_xyxy))
+        fused = self.advance(motion, anchor, confidence)
+        return replace(fused, certain=fused.T_cam_target is not None)
+
+    def spread(self, selection: Selection, T_cam_target: Float) -> Float:
+        """Zero (6, 6): here the anchors are the residuals, their spread is known already."""
+        return np.zeros((6, 6))
+
+    def advance(self, motion: Motion, anchor: Float | None, confidence: float) -> Fused:
         """Advance by one frame.
 
         Args:

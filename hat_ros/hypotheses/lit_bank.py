@@ -2,7 +2,7 @@
 
 Before a black sky a mask holds only what is lit, so its shape may be that of no view at all. The brightness itself does
 not suffer: what is dark weighs nothing, in the image as in the prediction. Each view under each sun is laid on the same
-polar grid as the silhouettes of :mod:`hat_ros.hypotheses.bank`, about the centroid of its light, so that the same
+polar grid as the silhouettes of :mod:`hat_ros.target.view_bank`, about the centroid of its light, so that the same
 product of spectra correlates it with an image at every in-plane angle. Of what is compared the root is taken: gloss,
 which the model does not know, would outweigh everything else.
 """
@@ -15,7 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hat_ros.cache import cached_arrays
-from hat_ros.hypotheses.bank import (
+from hat_ros.refinement.sunlight import brightness
+from hat_ros.refinement.view import Surfels, TargetViewer
+from hat_ros.target.contour import COL_NU, COL_NV, COL_U, COL_V, COL_WEIGHT, contour_table
+from hat_ros.target.embree import pixel_rays
+from hat_ros.target.view_bank import (
     CONTOUR_POINTS,
     MAX_RADIUS,
     N_RINGS,
@@ -24,10 +28,6 @@ from hat_ros.hypotheses.bank import (
     polar_grid,
     view_rotations,
 )
-from hat_ros.refinement.contour import COL_NU, COL_NV, COL_U, COL_V, COL_WEIGHT, contour_table
-from hat_ros.refinement.sunlight import brightness
-from hat_ros.refinement.view import Surfels, TargetViewer
-from hat_ros.target.embree import pixel_rays
 from hat_ros.types import Camera
 
 _FORMAT = 2

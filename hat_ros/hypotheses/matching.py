@@ -15,7 +15,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from hat_ros.geometry import lie
-from hat_ros.hypotheses.bank import (
+from hat_ros.hypotheses.lit_bank import subdued
+from hat_ros.target.view_bank import (
     MAX_RADIUS,
     N_RINGS,
     PolarSampler,
@@ -26,7 +27,6 @@ from hat_ros.hypotheses.bank import (
     polar_grid,
     ring_weights,
 )
-from hat_ros.hypotheses.lit_bank import subdued
 from hat_ros.types import Camera
 
 # What silhouette without mask costs, against mask without silhouette = 1. A part that lies in shadow or outside the

@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 from hat_ros.config import HatConfig
 from hat_ros.errors import ConfigError
 from hat_ros.geometry import lie
-from hat_ros.hypotheses.bank import ViewBank, load_or_build, without_thin_parts
 from hat_ros.hypotheses.box import silhouette_in_box
 from hat_ros.hypotheses.lit_bank import load_or_build_lit
 from hat_ros.hypotheses.matching import (
@@ -54,6 +53,7 @@ from hat_ros.segmentation.glow import look_into_space
 from hat_ros.target.model import Target
 from hat_ros.target.rendering import create_renderer
 from hat_ros.target.symmetry import load_or_find_symmetries, turned
+from hat_ros.target.view_bank import ViewBank, load_or_build, without_thin_parts
 from hat_ros.types import Camera, Candidates, Detection, Frame, PosePrior
 
 _VIEW_COUNTS = (162, 642, 2562)

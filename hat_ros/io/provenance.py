@@ -12,15 +12,17 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import hat_ros
 from hat_ros.config import HatConfig, config_to_dict
 
 _PACKAGES = ("hat_ros", "numpy", "scipy", "opencv-python-headless", "embreex", "numba", "rosbags", "torch")
 _BLOCK_BYTES = 1 << 20
+_PACKAGE = Path(hat_ros.__file__).resolve().parent
 
 
 def code_version() -> str:
     """Commit of the checkout, with ``+changes`` when files differ from it; the package version when installed."""
-    root = Path(__file__).resolve().parent.parent
+    root = _PACKAGE.parent
     if not (root / ".git").exists():  # installed, perhaps within somebody else's checkout
         return _version("hat_ros") or "unknown"
     try:
@@ -80,7 +82,6 @@ def describe_run(source: Path, source_sha256: str, config: HatConfig, **more: An
 def code_hash() -> str:
     """SHA-256 over the package's Python sources: what the code really was, committed or not."""
     digest = hashlib.sha256()
-    package = Path(__file__).resolve().parent
-    for item in sorted(package.rglob("*.py")):
-        digest.update(f"{item.relative_to(package)}\0".encode() + item.read_bytes())
+    for item in sorted(_PACKAGE.rglob("*.py")):
+        digest.update(f"{item.relative_to(_PACKAGE)}\0".encode() + item.read_bytes())
     return digest.hexdigest()

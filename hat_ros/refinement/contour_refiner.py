@@ -78,7 +78,7 @@ class _Task:
     view: View | None
 
 
-class FusedPoseRefiner:
+class ContourRefiner:
     """Contour refinement of one pose per frame; uses nothing but the present frame.
 
     Args:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from hat_ros.geometry import lie
-from hat_ros.refinement.contour import (
+from hat_ros.refinement.hits import facing, hit_points, image_box, normals_towards
+from hat_ros.target.contour import (
     COL_INSIDE,
     COL_NU,
     COL_NV,
@@ -20,7 +21,6 @@ from hat_ros.refinement.contour import (
     COL_WEIGHT,
     contour_table,
 )
-from hat_ros.refinement.hits import facing, hit_points, image_box, normals_towards
 from hat_ros.target.embree import RayCaster
 from hat_ros.target.model import Target
 from hat_ros.target.outline import Hits, Outlined, Rays, cast_outlined

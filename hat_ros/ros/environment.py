@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import ctypes
 import os
-import sys
 from pathlib import Path
 
 import cv2
+
+from hat_ros.config import preset_folder
 
 PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
@@ -20,15 +21,10 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 
 
 def profile_path(shared_memory: Path = Path("/dev/shm")) -> Path | None:
-    """The Fast DDS profile shipped with the package, chosen by how much shared memory is free.
-
-    It lies in a checkout, in a prefix, or in a colcon install space; None when it is nowhere.
-    """
+    """The Fast DDS profile shipped with the package, chosen by the free shared memory; None if it is missing."""
     name = "fastdds.xml" if _free_bytes(shared_memory) >= _AMPLE_SHARED_BYTES else "fastdds_small.xml"
-    here = Path(__file__).resolve()
-    folders = [here.parents[2] / "config", Path(sys.prefix) / "share" / "hat_ros" / "config"]
-    folders += [parent / "share" / "hat_ros" / "config" for parent in here.parents[4:]]
-    return next((folder / name for folder in folders if (folder / name).is_file()), None)
+    path = preset_folder() / name
+    return path if path.is_file() else None
 
 
 def _free_bytes(folder: Path) -> int:

@@ -10,9 +10,9 @@ import numpy as np
 
 from hat_ros.core.fusion import FusionStage
 from hat_ros.io import messages, topics
-from hat_ros.refinement import create_refiner
 from hat_ros.ros import base, process
 from hat_ros.ros.stage_node import StageNode
+from hat_ros.tracker import choose_fusion
 from hat_ros.types import Camera, Detection, Estimate, Frame
 
 # Without a refiner only the frame's stamp counts, so no image is sent here.
@@ -48,7 +48,7 @@ class FusionNode(StageNode):
 
     def create_stage(self) -> FusionStage:
         """The stage object."""
-        return FusionStage(self.settings.config, create_refiner(self.settings.config, self.target))
+        return FusionStage(self.settings.config, choose_fusion(self.settings.config, self.target))
 
     def step(self, stamp_ns: int, frame_id: str, admitted: messages.Admitted, items: dict[str, Any]) -> None:
         """Estimate of one frame; the status goes last, because it lets the next frame in."""
@@ -59,7 +59,7 @@ class FusionNode(StageNode):
         if estimate.state.has_pose:
             self._publish_pose(frame_id, estimate)
         self._margin = estimate.margin
-        self._status.publish(self.messages.status(frame_id, estimate, admitted))
+        self._status.publish(self.wire.status(frame_id, estimate, admitted))
         self.report(base.OK, estimate.state.name.lower())
 
     def values(self) -> dict[str, Any]:
@@ -86,9 +86,9 @@ class FusionNode(StageNode):
         if alignment is not None and version != self._version:
             slam_frame_id = f"slam_{alignment.epoch}"
             row = np.concatenate([alignment.translation_m, alignment.quat_xyzw])
-            message = self.messages.alignment(stamp_ns, slam_frame_id, alignment)
+            message = self.wire.alignment(stamp_ns, slam_frame_id, alignment)
             self._emit[topics.ALIGNMENT].publish(message)
-            transform = self.messages.transform(stamp_ns, self._target_frame_id, slam_frame_id, row)
+            transform = self.wire.transform(stamp_ns, self._target_frame_id, slam_frame_id, row)
             self._emit[topics.ALIGNMENT_TRANSFORM].publish(transform)
         self._version = version
 

@@ -32,9 +32,9 @@ class HypothesesNode(StageNode):
         """Candidates of one frame."""
         frame, detection = self.frame_of(stamp_ns, items[topics.FRAME])
         candidates = self.stage.update(frame, detection, self.prior_of(stamp_ns))
-        self._scored.publish(self.messages.candidates(stamp_ns, frame_id, candidates))
+        self._scored.publish(self.wire.candidates(stamp_ns, frame_id, candidates))
         if len(candidates):
-            self._shown.publish(self.messages.pose_array(stamp_ns, frame_id, candidates.pose_rows))
+            self._shown.publish(self.wire.pose_array(stamp_ns, frame_id, candidates.pose_rows))
 
 
 def main() -> int:

@@ -67,7 +67,7 @@ class OverlayNode(base.HatNode):
         image = self._painter.paint(rgb, self._camera, estimate.state, pose_row)
         quality = [cv2.IMWRITE_JPEG_QUALITY, self.settings.extra["jpeg_quality"]]
         data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), quality)[1].tobytes()
-        self._drawn.publish(self.messages.compressed(estimate.stamp_ns, frame.header.frame_id, "jpeg", data))
+        self._drawn.publish(self.wire.compressed(estimate.stamp_ns, frame.header.frame_id, "jpeg", data))
 
 
 def main() -> int:

@@ -170,11 +170,11 @@ class PlayerNode(base.HatNode):
 
     def _send(self, packet: Packet) -> None:
         if self.published == 0:
-            camera_info = self.messages.camera_info(packet.stamp_ns, self.bag.frame_id, self.bag.camera)
+            camera_info = self.wire.camera_info(packet.stamp_ns, self.bag.frame_id, self.bag.camera)
             self._camera_info.publish(camera_info)
         if self._mask is not None:
             empty = np.zeros((0, 0), dtype=np.uint8)
-            message = packet.mask or self.messages.image(packet.stamp_ns, self.bag.frame_id, "mono8", empty)
+            message = packet.mask or self.wire.image(packet.stamp_ns, self.bag.frame_id, "mono8", empty)
             self._mask.publish(message)
         if self.outstanding == 0:
             self.progress_s = time.monotonic()
@@ -184,7 +184,7 @@ class PlayerNode(base.HatNode):
 
     def _finish(self) -> None:
         stamp_ns = max(self.sent_s, default=0)
-        self._end.publish(self.messages.header(stamp_ns, self.bag.frame_id))
+        self._end.publish(self.wire.header(stamp_ns, self.bag.frame_id))
         self._end.wait_for_all_acked(Duration(seconds=5))
         self.finished = True
 

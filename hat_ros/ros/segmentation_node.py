@@ -121,16 +121,16 @@ class SegmentationNode(base.HatNode):
         stamp_ns = frame.stamp_ns
         if not self._camera_sent:
             self._camera_sent = True
-            self._camera_info.publish(self.messages.camera_info(stamp_ns, frame_id, frame.camera))
+            self._camera_info.publish(self.wire.camera_info(stamp_ns, frame_id, frame.camera))
             self._camera_info.wait_for_all_acked(Duration(seconds=5))  # it must be there before its first image
         seq = self.admission.admit(stamp_ns)
         self._entered_s[stamp_ns] = time.monotonic()
         admitted = messages.Admitted(seq, self.entrance.dropped_total, self.epoch)
-        self._admission.publish(self.messages.admission(stamp_ns, frame_id, admitted))
+        self._admission.publish(self.wire.admission(stamp_ns, frame_id, admitted))
         self._delay.wait()
         with self._step_timer.frame():
             detection = self.stage.update(frame, self.priors.before(stamp_ns))
-            self._frame.publish(self.messages.frame(stamp_ns, frame_id, frame.rgb, detection))
+            self._frame.publish(self.wire.frame(stamp_ns, frame_id, frame.rgb, detection))
 
     def _check_time(self) -> None:
         """A stage that does not answer: a replay ends, a live graph goes on in a new epoch."""

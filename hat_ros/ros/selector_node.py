@@ -32,10 +32,10 @@ class SelectorNode(StageNode):
         """Selection of one frame."""
         candidates = messages.candidates_from(items[topics.HYPOTHESES_SCORED])
         selection = self.stage.update(candidates, messages.motion_from(items[topics.SLAM_STATE]))
-        self._selection.publish(self.messages.selection(stamp_ns, frame_id, selection))
+        self._selection.publish(self.wire.selection(stamp_ns, frame_id, selection))
         if selection.selected >= 0:
             row = selection.candidates.pose_rows[selection.selected]
-            self._anchor.publish(self.messages.pose(stamp_ns, frame_id, row))
+            self._anchor.publish(self.wire.pose(stamp_ns, frame_id, row))
 
 
 def main() -> int:

@@ -32,9 +32,9 @@ class SlamNode(StageNode):
         """Motion state of one frame."""
         frame, detection = self.frame_of(stamp_ns, items[topics.FRAME])
         motion = self.stage.update(frame, detection, self.prior_of(stamp_ns))
-        self._state.publish(self.messages.motion(stamp_ns, frame_id, motion))
+        self._state.publish(self.wire.motion(stamp_ns, frame_id, motion))
         if motion.valid:
-            self._odometry.publish(self.messages.odometry(stamp_ns, frame_id, motion))
+            self._odometry.publish(self.wire.odometry(stamp_ns, frame_id, motion))
 
 
 def main() -> int:

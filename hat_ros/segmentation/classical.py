@@ -13,9 +13,10 @@ from __future__ import annotations
 import numpy as np
 
 from hat_ros.config import HatConfig
+from hat_ros.geometry.masks import overlap
 from hat_ros.segmentation.glow import look_into_space
 from hat_ros.segmentation.lit import LitBody
-from hat_ros.segmentation.masks import Mask, enlarge, overlap
+from hat_ros.segmentation.masks import Mask, enlarge
 from hat_ros.segmentation.shape import SilhouetteBank
 from hat_ros.segmentation.textured import TexturedBackground
 from hat_ros.target.embree import EmbreeRenderer

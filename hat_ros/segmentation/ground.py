@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hat_ros.segmentation.masks import Mask, Window, overlap
+from hat_ros.geometry.masks import overlap
+from hat_ros.segmentation.masks import Mask, Window
 
 _SIDE_PX = 320  # longer side of the frames remembered
 _MAX_POINTS = 80

@@ -13,12 +13,6 @@ Mask = NDArray[np.uint8]
 SIDES = ("top", "bottom", "left", "right")
 
 
-def overlap(a: Mask, b: Mask) -> float:
-    """Intersection over union; 0 when both are empty."""
-    union = np.count_nonzero(a | b)
-    return np.count_nonzero(a & b) / union if union else 0.0
-
-
 def touches_border(mask: Mask) -> bool:
     """Whether a mask reaches the image border."""
     return bool(touched_sides(mask))

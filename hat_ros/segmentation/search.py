@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hat_ros.config import ClassicalConfig
+from hat_ros.geometry.masks import overlap
 from hat_ros.segmentation import region
 from hat_ros.segmentation.boundary import refine_outline
 from hat_ros.segmentation.ground import CLEAR, GroundMemory
-from hat_ros.segmentation.masks import Mask, Window, overlap, shrink, touched_sides, touches_border
+from hat_ros.segmentation.masks import Mask, Window, shrink, touched_sides, touches_border
 from hat_ros.segmentation.motion import MotionDetector, MotionEvidence
 from hat_ros.segmentation.outlines import SharpOutlines, is_grey
 from hat_ros.segmentation.shape import SilhouetteBank

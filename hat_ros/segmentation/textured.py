@@ -7,10 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hat_ros.config import ClassicalConfig
+from hat_ros.geometry.masks import overlap
 from hat_ros.segmentation import region
 from hat_ros.segmentation.boundary import rehearse
 from hat_ros.segmentation.ground import GroundEvidence
-from hat_ros.segmentation.masks import SIDES, Mask, Window, moved, overlap, shift_between, touched_sides
+from hat_ros.segmentation.masks import SIDES, Mask, Window, moved, shift_between, touched_sides
 from hat_ros.segmentation.search import (
     AGREEMENT,
     MIN_CONTRAST,

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from hat_ros.cache import cached_arrays
 from hat_ros.geometry import lie
-from hat_ros.hypotheses.bank import view_rotations
-from hat_ros.segmentation.masks import overlap
+from hat_ros.geometry.masks import overlap
 from hat_ros.target.embree import EmbreeRenderer
 from hat_ros.target.model import Target
+from hat_ros.target.view_bank import view_rotations
 from hat_ros.types import Camera
 
 _FORMAT = 1

@@ -30,13 +30,15 @@ import numpy as np
 from hat_ros.config import HatConfig, RefinementConfig
 from hat_ros.core.alignment import SlamAlignment
 from hat_ros.core.cadence import Cadence
-from hat_ros.core.published_fusion import Dissent, Fused, fuse_two, relative_motion
-from hat_ros.core.uncertainty import widened
+from hat_ros.core.published_fusion import AreaConfidence, Dissent, Fused, fuse_two, relative_motion
+from hat_ros.core.selector import box_area_px
 from hat_ros.geometry import lie
 from hat_ros.tracking.attitude import AttitudeFilter
+from hat_ros.tracking.confidence import BasinConfidence
 from hat_ros.tracking.prior import extrapolate
 from hat_ros.tracking.refiner import Refiner
-from hat_ros.types import Detection, Float, Frame, Motion, Refined, RotationPrior
+from hat_ros.tracking.uncertainty import KeyframeSpread, widened
+from hat_ros.types import Detection, Float, Frame, Motion, Refined, RotationPrior, Selection
 
 # An anchor further from where the track expected it than this share of D shares its basin, but bears no witness to it.
 _CLOSE_SHARE = 0.5
@@ -49,7 +51,7 @@ _INTERRUPTION_FRAMES = 5
 _RATE_HISTORY = 6
 
 
-class RefinedFusion:
+class ImageFusion:
     """Track, anchors and image evidence, frame by frame.
 
     Attributes:
@@ -60,9 +62,17 @@ class RefinedFusion:
         self._fusion, self._refinement = config.fusion, config.refinement
         self._alignment_config = config.alignment
         self._refiner = refiner
-        self.alignment = SlamAlignment(config.alignment)
-        self._dissent = Dissent(config.fusion.gate_angle_deg, config.alignment.reset_anchors)
-        self._attitude = AttitudeFilter(np.radians(config.refinement.start_sigma_deg))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the target's state; the next anchor starts afresh."""
+        self._refiner.reset()
+        self.alignment = SlamAlignment(self._alignment_config)
+        self._area_confidence = AreaConfidence(self._fusion)
+        self._confidence = BasinConfidence(self._refinement, self._fusion.gate_angle_deg)
+        self._spread = KeyframeSpread(self._fusion.gate_angle_deg)
+        self._dissent = Dissent(self._fusion.gate_angle_deg, self._alignment_config.reset_anchors)
+        self._attitude = AttitudeFilter(np.radians(self._refinement.start_sigma_deg))
         self._cadence = Cadence()
         self._lead = 0.0
         self._epoch = 0
@@ -80,12 +90,28 @@ class RefinedFusion:
         self._attitude.forget()
         self._held: Refined | None = None
         self._best_quality = 0.0
+        self._confirmed = False  # the image is certain of the basin, or an anchor has agreed with it
         self._founded = False  # by an anchor that was the decoder's clear choice
         self._n_agreed = 0  # such anchors since
         self._n_disagreed = 0
         self._forget_rivals()
 
-    def update(
+    def update(self, frame: Frame, detection: Detection | None, motion: Motion, selection: Selection) -> Fused:
+        """Advance by one frame. See :class:`~hat_ros.core.fusion.FusionMethod`."""
+        anchor, confidence, decided = selection.anchor, 1.0, False
+        if anchor is not None:
+            confidence = self._area_confidence.update(box_area_px(selection.candidates.box_xyxy))
+            # An anchor that barely won speaks for no track, nor does it alone overthrow one.
+            decided = self._confidence.decides(selection, anchor)
+        fused = self._advance(frame, detection, motion, anchor, confidence, decided)
+        self._confidence.update(selection, fused.T_cam_target)
+        return replace(fused, certain=fused.certain and self._confidence.vouches(self._confirmed))
+
+    def spread(self, selection: Selection, T_cam_target: Float) -> Float:
+        """(6, 6) spread of the hypotheses about the output over the last keyframes (:class:`KeyframeSpread`)."""
+        return self._spread.update(selection, T_cam_target)
+
+    def _advance(
         self,
         frame: Frame,
         detection: Detection | None,
@@ -94,11 +120,6 @@ class RefinedFusion:
         confidence: float,
         decided: bool,
     ) -> Fused:
-        """Advance by one frame; arguments as :meth:`CausalFusion.update`, beside the image.
-
-        ``decided``: the decoder prefers the anchor's basin clearly. An anchor that barely won speaks for no track, nor
-        does it alone overthrow one.
-        """
         if motion.epoch != self._epoch:
             self._epoch = motion.epoch
             self.alignment.reset()
@@ -285,14 +306,14 @@ class RefinedFusion:
         self._best_quality = max(self._best_quality, quality(refined))
         explained = self._best_quality >= _EXPLAINED_QUALITY
         # An unknown overlap (NaN) is never certain.
-        certain = min(refined.overlap, refined.support) >= self._refinement.certain_share or self._n_agreed > 0
+        sure = min(refined.overlap, refined.support) >= self._refinement.certain_share
+        self._confirmed = sure or self._n_agreed > 0
         return Fused(
             T,
             predicted,
             measurement=T,
             covariance=widened(refined.covariance, refined.misfit_px, self._basin(T)),
-            confirmed=certain,
-            doubtful=self._n_disagreed > 1 or not (explained or self._n_agreed >= _WITNESSES),
+            certain=self._n_disagreed <= 1 and (explained or self._n_agreed >= _WITNESSES),
         )
 
     def _basin(self, T_cam_target: Float) -> Float:

@@ -22,7 +22,7 @@ from hat_ros.io.bag import BagWriter
 
 def run(frames):
     method = ScriptedMethod()
-    pipeline = Pipeline(method)
+    pipeline = Pipeline(lambda wrap: method)
     return list(pipeline.run(frames)), pipeline, method
 
 
@@ -64,12 +64,12 @@ def test_frames_are_read_by_one_thread_and_an_error_of_reading_ends_the_run():
 
     done = []
     with pytest.raises(BagError, match="breaks off"):
-        for answer in Pipeline(ScriptedMethod(), credits=2).run(recording()):
+        for answer in Pipeline(lambda wrap: ScriptedMethod(), credits=2).run(recording()):
             done.append(answer.step.estimate.stamp_ns)
     assert done == [stamp(i) for i in range(3)]
     assert len(threads) == 1
     threads.clear()
-    abandoned = Pipeline(ScriptedMethod()).run(recording())
+    abandoned = Pipeline(lambda wrap: ScriptedMethod()).run(recording())
     next(abandoned)
     abandoned.close()
     assert len(threads) == 1, "closed by the thread that read it"

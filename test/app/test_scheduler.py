@@ -3,12 +3,13 @@
 import random
 import threading
 import time
+from functools import partial
 
 import pytest
 from scripted import ScriptedMethod, frame, stamp
 
 from hat_ros.app.pipeline import Pipeline
-from hat_ros.app.scheduler import Closed, Turnstiles
+from hat_ros.app.scheduler import Closed, StageScheduler
 from hat_ros.bench.methods import create_method
 from hat_ros.bench.synth.clips import ClipSpec, render_clip
 from hat_ros.bench.synth.models import build_target
@@ -40,20 +41,25 @@ class ThreeStages(ScriptedMethod):
         super().__init__()
         delays = random.Random(seed)
         self.stages = {name: Stage(delays) for name in ("segmentation", "hypotheses", "motion")}
+        self.wrapped = self.stages
         self.before_first, self.fails_at = [], fails_at
         self.most_at_once, self._now = 0, 0
+
+    def behind(self, wrap):
+        self.wrapped = {name: wrap(name, stage) for name, stage in self.stages.items()}
+        return self
 
     def step(self, seen):
         index = (seen.stamp_ns - stamp(0)) // (stamp(1) - stamp(0))
         self.before_first.append(index)
-        self.stages["segmentation"].update(index)
+        self.wrapped["segmentation"].update(index)
         self._now += 1
         self.most_at_once = max(self.most_at_once, self._now)
         if index % 3 == 0:
-            self.stages["hypotheses"].update(index)
+            self.wrapped["hypotheses"].update(index)
         if index == self.fails_at:
             raise RunError(f"frame {index} broke the motion")
-        self.stages["motion"].update(index)
+        self.wrapped["motion"].update(index)
         self._now -= 1
         return super().step(seen)
 
@@ -62,7 +68,7 @@ class ThreeStages(ScriptedMethod):
 @pytest.mark.parametrize("seed", range(3))
 def test_each_stage_sees_the_frames_one_by_one_in_order(credits, seed):
     method = ThreeStages(seed)
-    done = list(Pipeline(method, credits).run(frame(i) for i in range(20)))
+    done = list(Pipeline(method.behind, credits).run(frame(i) for i in range(20)))
     assert [d.step.estimate.stamp_ns for d in done] == [stamp(i) for i in range(20)]
     assert method.before_first == list(range(20))
     assert method.stages["segmentation"].seen == method.stages["motion"].seen == list(range(20))
@@ -75,7 +81,7 @@ def test_each_stage_sees_the_frames_one_by_one_in_order(credits, seed):
 def test_a_method_that_follows_its_own_last_answer_gets_one_frame_at_a_time():
     method = ThreeStages()
     method.concurrent = False
-    list(Pipeline(method, 4).run(frame(i) for i in range(10)))
+    list(Pipeline(method.behind, 4).run(frame(i) for i in range(10)))
     assert method.most_at_once == 1
 
 
@@ -84,7 +90,7 @@ def test_frames_before_one_that_fails_are_answered_and_its_error_is_the_one_seen
     method = ThreeStages(fails_at=7)
     answered = []
     with pytest.raises(RunError, match="frame 7 broke"):
-        for done in Pipeline(method, credits).run(frame(i) for i in range(20)):
+        for done in Pipeline(method.behind, credits).run(frame(i) for i in range(20)):
             answered.append(done.step.estimate.stamp_ns)
     assert answered == [stamp(i) for i in range(7)]
     assert method.stages["motion"].seen == list(range(7))
@@ -92,18 +98,18 @@ def test_frames_before_one_that_fails_are_answered_and_its_error_is_the_one_seen
 
 def test_who_stops_listening_stops_the_threads():
     before = threading.active_count()
-    run = Pipeline(ThreeStages(), 4).run(frame(i) for i in range(1000))
+    run = Pipeline(ThreeStages().behind, 4).run(frame(i) for i in range(1000))
     next(run)
     run.close()
     assert threading.active_count() == before
 
 
-def test_a_closed_turnstile_lets_nobody_wait():
-    turnstiles = Turnstiles({})
-    turnstiles.close(3)
-    with turnstiles.frame(0):
+def test_a_closed_scheduler_lets_nobody_wait():
+    scheduler = StageScheduler()
+    scheduler.close(3)
+    with scheduler.frame(0):
         pass
-    with pytest.raises(Closed), turnstiles.frame(3):
+    with pytest.raises(Closed), scheduler.frame(3):
         pass
 
 
@@ -115,8 +121,8 @@ def test_poses_do_not_depend_on_the_frames_in_flight():
     config = load_config("default", ("hypotheses.template.n_views=162", "keyframes.gap_frames=3"))
     runs = {}
     for credits in (1, 4):
-        method = create_method("hat", config, target)
-        runs[credits] = [done.step for done in Pipeline(method, credits).run(frames)]
+        pipeline = Pipeline(partial(create_method, "hat", config, target), credits)
+        runs[credits] = [done.step for done in pipeline.run(frames)]
     for alone, among in zip(runs[1], runs[4], strict=True):
         assert alone.estimate.pose_row.tobytes() == among.estimate.pose_row.tobytes()
         assert alone.estimate.covariance.tobytes() == among.estimate.covariance.tobytes()

@@ -9,7 +9,7 @@ import pytest
 from hat_ros.bench.experiments.comparison import Entry
 from hat_ros.cli import build_parser
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PAGES = ("README.md", "docs/benchmark.md")
 
 

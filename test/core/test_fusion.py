@@ -4,15 +4,20 @@ import numpy as np
 import pytest
 from temporal_scene import make_scene, preset
 
+from hat_ros.core.covariance import ResidualCovariance
 from hat_ros.core.fusion import FusionStage
+from hat_ros.core.published_fusion import PublishedFusion
 from hat_ros.core.selector import SelectorStage
-from hat_ros.core.uncertainty import ResidualCovariance
 from hat_ros.geometry import lie
 from hat_ros.types import Camera, Candidates, Frame, Motion, Selection, TrackState
 
 
 def frame(index):
     return Frame((index + 1) * 10**8, np.zeros((1, 1, 3), np.uint8), Camera(np.eye(3), 1, 1))
+
+
+def _stage(config):
+    return FusionStage(config, PublishedFusion(config))
 
 
 def _selection(T_cam_target):
@@ -32,7 +37,7 @@ def _run(stage, scene, frames, anchored=True, moving=True):
 
 def test_states_from_the_first_anchor_to_lost_and_back():
     scene = make_scene(200)
-    stage = FusionStage(preset(fusion={"coast_limit_frames": 10}), None)
+    stage = _stage(preset(fusion={"coast_limit_frames": 10}))
     before = _run(stage, scene, range(1, 4))
     assert [e.state for e in before] == [TrackState.UNINITIALISED] * 3
     assert all(np.isnan(e.pose_row).all() and np.isnan(e.covariance).all() for e in before)
@@ -55,7 +60,7 @@ def test_states_from_the_first_anchor_to_lost_and_back():
 
 def test_motion_without_anchors_is_lost_in_the_end():
     scene = make_scene(120)
-    stage = FusionStage(preset(fusion={"coast_limit_frames": 30}), None)
+    stage = _stage(preset(fusion={"coast_limit_frames": 30}))
     _run(stage, scene, range(41))
     drifting = _run(stage, scene, range(41, 120), anchored=False)
     assert [e.state for e in drifting[:30]] == [TrackState.TRACKING] * 30
@@ -64,7 +69,7 @@ def test_motion_without_anchors_is_lost_in_the_end():
 
 def test_the_estimate_reports_what_happened():
     scene = make_scene(40)
-    estimates = _run(FusionStage(preset(), None), scene, range(40))
+    estimates = _run(_stage(preset()), scene, range(40))
     assert [e.stamp_ns for e in estimates] == [(i + 1) * 10**8 for i in range(40)]
     assert [e.keyframe for e in estimates] == scene.observations.key.tolist()
     assert [e.anchor for e in estimates] == np.where(scene.observations.key, 0, -1).tolist()
@@ -76,7 +81,7 @@ def test_the_estimate_reports_what_happened():
 
 def test_quaternions_stay_in_one_hemisphere_through_full_turns():
     scene = make_scene(400, rate_deg=4.0)
-    rows = np.stack([e.pose_row for e in _run(FusionStage(preset(), None), scene, range(400))])
+    rows = np.stack([e.pose_row for e in _run(_stage(preset()), scene, range(400))])
     assert (np.sum(rows[1:, 3:] * rows[:-1, 3:], axis=1) > 0.5).all()
     assert (rows[:, 6] < 0).any()
     assert (rows[:, 6] > 0).any()
@@ -84,10 +89,10 @@ def test_quaternions_stay_in_one_hemisphere_through_full_turns():
 
 def test_a_reset_stage_is_a_new_stage():
     scene = make_scene(60)
-    stage = FusionStage(preset(), None)
+    stage = _stage(preset())
     _run(stage, scene, range(30, 60))
     stage.reset()
-    again, fresh = _run(stage, scene, range(60)), _run(FusionStage(preset(), None), scene, range(60))
+    again, fresh = _run(stage, scene, range(60)), _run(_stage(preset()), scene, range(60))
     for a, b in zip(again, fresh, strict=True):
         assert a.pose_row.tobytes() == b.pose_row.tobytes()
         assert a.covariance.tobytes() == b.covariance.tobytes()
@@ -112,7 +117,7 @@ def _size(value, seen):
 def test_the_state_of_stages_three_and_four_does_not_grow(name):
     config = preset(name, alignment={"max_observations": 32})
     scene = make_scene(400, k=3, gap=2)
-    selector, fusion, sizes = SelectorStage(config.selector), FusionStage(config, None), []
+    selector, fusion, sizes = SelectorStage(config.selector), _stage(config), []
     for i in range(400):
         motion = scene.observations.motion(i)
         selection = selector.update(scene.observations.candidates(i, config.hypotheses.guard), motion)
@@ -125,7 +130,7 @@ def test_the_state_of_stages_three_and_four_does_not_grow(name):
 class TestCovariance:
     def test_is_symmetric_positive_and_grows_between_measurements(self):
         scene = make_scene(80)
-        stage = FusionStage(preset(), None)
+        stage = _stage(preset())
         estimates = _run(stage, scene, range(60)) + _run(stage, scene, range(60, 80), anchored=False)
         for e in estimates:
             np.testing.assert_allclose(e.covariance, e.covariance.T, atol=1e-18)

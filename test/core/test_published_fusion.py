@@ -6,7 +6,7 @@ import scipy.optimize
 from temporal_scene import HALF_TURN, make_scene, preset, rotation_error_deg
 
 from hat_ros.config import FusionConfig
-from hat_ros.core.published_fusion import AreaConfidence, CausalFusion, Dissent, relative_motion
+from hat_ros.core.published_fusion import AreaConfidence, Dissent, PublishedFusion, relative_motion
 from hat_ros.geometry import lie
 from hat_ros.types import Motion
 
@@ -20,8 +20,7 @@ def _pose(turn_deg, axis=(0, 1, 0)):
 
 
 def _fusion(name="mega_hat", **sections):
-    config = preset(name, **sections)
-    return CausalFusion(config.alignment, config.fusion)
+    return PublishedFusion(preset(name, **sections))
 
 
 def _feed(fusion, scene, frames, anchors=None, epoch=0):
@@ -30,7 +29,7 @@ def _feed(fusion, scene, frames, anchors=None, epoch=0):
     for i in frames:
         anchor = scene.T_cam_target[i] if anchors is None else anchors.get(i)
         anchor = anchor if scene.observations.key[i] else None
-        out.append(fusion.update(_motion(scene.observations.slam[i], epoch), anchor, 1.0))
+        out.append(fusion.advance(_motion(scene.observations.slam[i], epoch), anchor, 1.0))
     return out
 
 
@@ -115,7 +114,7 @@ class TestFusion:
         }
         for i in range(25):
             anchor = anchors.get(i)
-            fused = fusion.update(_motion(scene.observations.slam[i]), anchor, 1.0)
+            fused = fusion.advance(_motion(scene.observations.slam[i]), anchor, 1.0)
             poses.append(fused.T_cam_target)
         S = [fusion.alignment.aligned(scene.observations.slam[i]) for i in (23, 24)]
         M, predicted, w = anchors[24], S[1] @ lie.inverse(S[0]) @ poses[23], 0.1
@@ -183,6 +182,6 @@ class TestFusion:
             fusion = _fusion("pico_hat", fusion={"relative_weight": 1.0})
             _feed(fusion, scene, range(36))
             anchor = offset @ scene.T_cam_target[36]
-            fused = fusion.update(_motion(scene.observations.slam[36]), anchor, confidence)
+            fused = fusion.advance(_motion(scene.observations.slam[36]), anchor, confidence)
             pulls.append(rotation_error_deg(fused.T_cam_target, anchor))
         assert pulls[0] > 2 * pulls[1] > 4 * pulls[2]

@@ -3,8 +3,8 @@ import pytest
 from shape_scene import CAMERA, pose_errors, random_pose, spacecraft
 
 from hat_ros.geometry import lie
-from hat_ros.hypotheses import bank
 from hat_ros.hypotheses.matching import cut_placements, distinct, match_shape, whole_placement
+from hat_ros.target import view_bank
 from hat_ros.target.rendering import create_renderer
 
 
@@ -12,7 +12,7 @@ from hat_ros.target.rendering import create_renderer
 def scene():
     target = spacecraft()
     renderer = create_renderer("embree", target)
-    return target, renderer, bank.build(target, renderer, 642, 72)
+    return target, renderer, view_bank.build(target, renderer, 642, 72)
 
 
 @pytest.mark.parametrize("seed", range(5))

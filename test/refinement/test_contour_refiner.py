@@ -4,15 +4,15 @@ import pytest
 import trimesh
 from shape_scene import CAMERA, picture, pose_errors, random_pose, spacecraft, sunlit_picture
 
-from hat_ros.config import HatConfig, RefinementConfig
+from hat_ros.config import RefinementConfig
 from hat_ros.geometry import lie
-from hat_ros.refinement import create_refiner
+from hat_ros.refinement.contour_refiner import ContourRefiner
 from hat_ros.refinement.sunlight import Sunlight, SunMatcher
 from hat_ros.target.model import target_from_scene
 from hat_ros.tracking.image_fusion import is_supported
 from hat_ros.types import Detection, Frame, RotationPrior
 
-ENABLED = HatConfig(refinement=RefinementConfig(enabled=True))
+ENABLED = RefinementConfig(enabled=True)
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,7 @@ def target():
 
 @pytest.fixture(scope="module")
 def refiner(target):
-    return create_refiner(ENABLED, target)
+    return ContourRefiner(ENABLED, target)
 
 
 def perturbed(T, rng, angle_deg, shift):
@@ -31,10 +31,6 @@ def perturbed(T, rng, angle_deg, shift):
     out[:3, :3] = lie.so3_exp(np.radians(angle_deg) * axis / np.linalg.norm(axis)) @ T[:3, :3]
     out[:3, 3] *= 1 + rng.uniform(-shift, shift)
     return out
-
-
-def test_there_is_none_when_it_is_switched_off(target):
-    assert create_refiner(HatConfig(refinement=RefinementConfig(enabled=False)), target) is None
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -80,7 +76,7 @@ def test_a_dark_rim_makes_no_round_body_small_and_far_frame_after_frame(barrel, 
     frame, silhouette = sunlit_picture(barrel, T_true, to_sun)
     lit = silhouette & (frame.rgb.max(axis=2) > 12)
     assert in_shadow[0] < 1.0 - lit.sum() / silhouette.sum() < in_shadow[1]
-    refiner, T = create_refiner(ENABLED, barrel), T_true.copy()
+    refiner, T = ContourRefiner(ENABLED, barrel), T_true.copy()
     T[:3, 3] *= start
     for _ in range(10):
         T = refiner.refine(frame, Detection(lit), T).T_cam_target
@@ -215,6 +211,6 @@ def test_the_same_image_gives_the_same_bytes(target):
     T_true = random_pose(rng, target)
     frame, mask = picture(target, T_true)
     start = perturbed(T_true, rng, 2.0, 0.01)
-    first, second = (create_refiner(ENABLED, target).refine(frame, Detection(mask), start) for _ in range(2))
+    first, second = (ContourRefiner(ENABLED, target).refine(frame, Detection(mask), start) for _ in range(2))
     assert first.pose_row.tobytes() == second.pose_row.tobytes()
     assert first.covariance.tobytes() == second.covariance.tobytes()

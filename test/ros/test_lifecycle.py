@@ -236,13 +236,13 @@ def imported(tree):
 
 def test_only_the_nodes_import_rclpy():
     for path, tree in sources():
-        if path.parent.name != "nodes":
+        if path.parent.name != "ros":
             assert not any(name.split(".")[0] == "rclpy" for name in imported(tree)), path
 
 
 def test_no_node_ever_names_the_truth():
-    naming = {path.name for path, _ in sources() if "GROUND_TRUTH" in path.read_text() and path.parent.name == "nodes"}
-    assert naming == {"topics.py", "graph.py"}, "graph.py copies it from bag to record; no node subscribes or publishes"
+    naming = {path.name for path, _ in sources() if "GROUND_TRUTH" in path.read_text() and path.parent.name == "ros"}
+    assert naming == {"graph.py"}, "graph.py copies it from bag to record; no node subscribes or publishes"
 
 
 def test_launch_files_compile_and_ship_what_they_name():

@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 
+from hat_ros.geometry.masks import overlap
 from hat_ros.segmentation.masks import (
     Window,
     border_contact,
     fill_holes,
     moved,
-    overlap,
     shift_between,
     touched_sides,
 )

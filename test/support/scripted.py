@@ -44,7 +44,6 @@ class ScriptedMethod:
     concurrent = False
 
     def __init__(self) -> None:
-        self.stages: dict = {}
         self.seen: list[Frame] = []
 
     def step(self, seen: Frame) -> Step:

@@ -7,8 +7,9 @@ from PIL import Image
 from scipy import ndimage
 
 from hat_ros.geometry import lie
+from hat_ros.target import network_views
 from hat_ros.target.embree import RayCaster, pixel_rays
-from hat_ros.target.model import network_views, target_from_scene
+from hat_ros.target.model import target_from_scene
 from hat_ros.target.network_views import NetworkViewRenderer, encode_normal
 from hat_ros.types import Camera
 

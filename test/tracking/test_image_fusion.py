@@ -8,7 +8,7 @@ from temporal_scene import HALF_TURN, make_scene, preset, rotation_error_deg
 
 from hat_ros.core.fusion import FusionStage
 from hat_ros.geometry import lie
-from hat_ros.tracking.image_fusion import quality
+from hat_ros.tracking.image_fusion import ImageFusion, quality
 from hat_ros.types import Camera, Candidates, Frame, Motion, Refined, Selection, TrackState
 
 COVARIANCE = np.diag([1e-6] * 6)
@@ -75,7 +75,7 @@ def _errors(estimates, scene, frames):
 
 def _stage(scene, evidence=None, **fusion):
     config = preset("default", fusion={"coast_limit_frames": 10, **fusion})
-    return FusionStage(config, BasinRefiner(scene, evidence))
+    return FusionStage(config, ImageFusion(config, BasinRefiner(scene, evidence)))
 
 
 def _noisy(i, T):
@@ -304,7 +304,8 @@ class TestCovariance:
                 refined = super().refine(*arguments)
                 return None if refined is None else replace(refined, misfit_px=misfit_px)
 
-        estimates = _run(FusionStage(preset("default"), Misfit(scene)), scene, range(20))
+        config = preset("default")
+        estimates = _run(FusionStage(config, ImageFusion(config, Misfit(scene))), scene, range(20))
         np.testing.assert_allclose(np.sqrt(np.diag(estimates[-1].covariance))[3:], sigma_rad, rtol=0.01)
 
 
@@ -351,7 +352,7 @@ def test_before_the_alignment_the_constant_rate_says_how_far_the_target_moves(sc
             starts.setdefault(frame.stamp_ns // 10**8 - 1, T_cam_target)
             return super().refine(frame, detection, T_cam_target, prior)
 
-    stage = FusionStage(preset("default"), Recording(scene))
+    stage = FusionStage(preset("default"), ImageFusion(preset("default"), Recording(scene)))
     estimates = _run(stage, scene, range(8))
     assert estimates[-1].alignment is None
     for i in range(3, 8):

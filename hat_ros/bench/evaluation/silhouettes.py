@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hat_ros.segmentation.masks import overlap
+from hat_ros.geometry.masks import overlap
 from hat_ros.tracker import Step
 
 Box = tuple[int, int, int, int]  # left, top, width, height

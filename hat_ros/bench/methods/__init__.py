@@ -13,13 +13,12 @@ Each offers what :class:`~hat_ros.tracker.HatTracker` offers, so the pipeline ru
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any, Protocol
 
+from hat_ros.app.pipeline import Method
 from hat_ros.config import HatConfig
 from hat_ros.errors import UsageError
 from hat_ros.target.model import Target
-from hat_ros.tracker import Step
-from hat_ros.types import Estimate, Frame
+from hat_ros.tracker import StageWrapper, unwrapped
 
 _METHODS = {
     "hat": "framewise:Hat",
@@ -32,29 +31,8 @@ _METHODS = {
 MODES = tuple(_METHODS)
 
 
-class Method(Protocol):
-    """What turns frames into poses."""
-
-    causal: bool
-    """Whether ``step`` gives the final answer; if not, :meth:`finish` does."""
-
-    concurrent: bool
-    """Whether steps of several frames may overlap by the rules of :mod:`hat_ros.app.scheduler`."""
-
-    stages: dict[str, Any]
-    """Stage name -> the object whose ``update`` is that stage; for timing."""
-
-    def step(self, frame: Frame) -> Step:
-        """Process one frame, stamps strictly increasing."""
-        ...
-
-    def finish(self) -> list[Estimate]:
-        """The estimates of all frames, for a method that is not causal; empty otherwise."""
-        ...
-
-
-def create_method(mode: str, config: HatConfig, target: Target) -> Method:
-    """Build the method that ``--mode`` names.
+def create_method(mode: str, config: HatConfig, target: Target, wrap: StageWrapper = unwrapped) -> Method:
+    """Build the method that ``--mode`` names; ``wrap`` as for :class:`~hat_ros.tracker.HatTracker`.
 
     Raises:
         UsageError: unknown mode.
@@ -63,4 +41,4 @@ def create_method(mode: str, config: HatConfig, target: Target) -> Method:
     if mode not in _METHODS:
         raise UsageError(f"mode '{mode}' is unknown, choose one of {', '.join(MODES)}")
     module, _, name = _METHODS[mode].partition(":")
-    return getattr(import_module(f"hat_ros.bench.methods.{module}"), name)(config, target)
+    return getattr(import_module(f"hat_ros.bench.methods.{module}"), name)(config, target, wrap)

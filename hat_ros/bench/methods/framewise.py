@@ -9,10 +9,10 @@ import numpy as np
 from hat_ros.config import HatConfig
 from hat_ros.hypotheses.stage import HypothesisStage
 from hat_ros.motion.stage import MotionStage
-from hat_ros.refinement import create_refiner
+from hat_ros.refinement.contour_refiner import ContourRefiner
 from hat_ros.segmentation.stage import SegmentationStage
 from hat_ros.target.model import Target
-from hat_ros.tracker import HatTracker, Step
+from hat_ros.tracker import HatTracker, StageWrapper, Step
 from hat_ros.tracking.refiner import Refiner
 from hat_ros.types import Candidates, Detection, Estimate, Frame, Motion, Refined, Selection, TrackState
 
@@ -26,12 +26,8 @@ class Hat:
     causal = True
     concurrent = True
 
-    def __init__(self, config: HatConfig, target: Target) -> None:
-        self._tracker = HatTracker(config, target)
-        self.stages = {
-            name: getattr(self._tracker, name)
-            for name in ("segmentation", "hypotheses", "motion", "selector", "fusion")
-        }
+    def __init__(self, config: HatConfig, target: Target, wrap: StageWrapper) -> None:
+        self._tracker = HatTracker(config, target, wrap)
 
     def step(self, frame: Frame) -> Step:
         """See :meth:`HatTracker.step`."""
@@ -48,11 +44,10 @@ class Independent:
     causal = True
     concurrent = True
 
-    def __init__(self, config: HatConfig, target: Target) -> None:
+    def __init__(self, config: HatConfig, target: Target, wrap: StageWrapper) -> None:
         config = replace(config, keyframes=replace(config.keyframes, gap_frames=1))
-        self._segmentation = SegmentationStage(config, target)
-        self._hypotheses = HypothesisStage(config, target)
-        self.stages = {"segmentation": self._segmentation, "hypotheses": self._hypotheses}
+        self._segmentation = wrap("segmentation", SegmentationStage(config, target))
+        self._hypotheses = wrap("hypotheses", HypothesisStage(config, target))
 
     def step(self, frame: Frame) -> Step:
         """One image, one answer."""
@@ -71,20 +66,15 @@ class Tracking:
     causal = True
     concurrent = False  # a step follows the pose of the one before
 
-    def __init__(self, config: HatConfig, target: Target) -> None:
+    def __init__(self, config: HatConfig, target: Target, wrap: StageWrapper) -> None:
         config = replace(
             config,
             keyframes=replace(config.keyframes, gap_frames=1),
             refinement=replace(config.refinement, enabled=True),
         )
-        self._segmentation = SegmentationStage(config, target)
-        self._hypotheses = HypothesisStage(config, target)
-        self._refinement = _LastPose(create_refiner(config, target))
-        self.stages = {
-            "segmentation": self._segmentation,
-            "hypotheses": self._hypotheses,
-            "fusion": self._refinement,
-        }
+        self._segmentation = wrap("segmentation", SegmentationStage(config, target))
+        self._hypotheses = wrap("hypotheses", HypothesisStage(config, target))
+        self._refinement = wrap("fusion", _LastPose(ContourRefiner(config.refinement, target)))
 
     def step(self, frame: Frame) -> Step:
         """Follow, or start afresh."""
@@ -129,12 +119,11 @@ class Observe:
     causal = True
     concurrent = True
 
-    def __init__(self, config: HatConfig, target: Target) -> None:
+    def __init__(self, config: HatConfig, target: Target, wrap: StageWrapper) -> None:
         config = replace(config, keyframes=replace(config.keyframes, gap_frames=1))
-        self._segmentation = SegmentationStage(config, target)
-        self._hypotheses = HypothesisStage(config, target)
-        self._motion = MotionStage(config, target)
-        self.stages = {"segmentation": self._segmentation, "hypotheses": self._hypotheses, "motion": self._motion}
+        self._segmentation = wrap("segmentation", SegmentationStage(config, target))
+        self._hypotheses = wrap("hypotheses", HypothesisStage(config, target))
+        self._motion = wrap("motion", MotionStage(config, target))
 
     def step(self, frame: Frame) -> Step:
         """Look, and say nothing."""

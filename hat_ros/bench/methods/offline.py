@@ -21,10 +21,10 @@ from hat_ros.bench.methods.smoothing import smooth_measured, solve_offline
 from hat_ros.config import HatConfig
 from hat_ros.geometry import lie
 from hat_ros.motion.stage import suppress_background
-from hat_ros.refinement import create_refiner
+from hat_ros.refinement.contour_refiner import ContourRefiner
 from hat_ros.stages import offline_motions_of
 from hat_ros.target.model import Target
-from hat_ros.tracker import Step
+from hat_ros.tracker import StageWrapper, Step
 from hat_ros.tracking.image_fusion import is_supported, quality
 from hat_ros.types import Camera, Detection, Estimate, Float, Frame, Motion, Refined, TrackState
 
@@ -39,14 +39,13 @@ class Offline:
     causal = False
     concurrent = False
 
-    def __init__(self, config: HatConfig, target: Target) -> None:
+    def __init__(self, config: HatConfig, target: Target, wrap: StageWrapper) -> None:
         self._config = config
-        self._hat = Hat(config, target)
-        self._refiner = create_refiner(config, target)
+        self._hat = Hat(config, target, wrap)
+        self._refiner = ContourRefiner(config.refinement, target) if config.refinement.enabled else None
         self._offline_motions = offline_motions_of(config)
         self._steps: list[Step] = []
         self._images = _StoredClip(config.slam.masked)
-        self.stages = self._hat.stages
 
     def step(self, frame: Frame) -> Step:
         """Observe; the estimate in the returned step is the causal one."""

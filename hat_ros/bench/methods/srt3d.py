@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from hat_ros.config import HatConfig
 from hat_ros.geometry import lie
 from hat_ros.hypotheses.stage import HypothesisStage
-from hat_ros.refinement.contour import MAX_FREE_PX
 from hat_ros.refinement.view import TargetViewer, contour_lines
 from hat_ros.segmentation.stage import SegmentationStage
+from hat_ros.target.contour import MAX_FREE_PX
 from hat_ros.target.model import Target
-from hat_ros.tracker import Step
+from hat_ros.tracker import StageWrapper, Step
 from hat_ros.types import Camera, Candidates, Estimate, Frame, Motion, Selection, TrackState
 
 Float = NDArray[np.float64]
@@ -239,14 +239,13 @@ class Srt3d:
     causal = True
     concurrent = False  # a step follows the pose of the one before
 
-    def __init__(self, config: HatConfig, target: Target) -> None:
+    def __init__(self, config: HatConfig, target: Target, wrap: StageWrapper) -> None:
         config = replace(config, keyframes=replace(config.keyframes, gap_frames=1))
-        self._segmentation = SegmentationStage(config, target)
-        self._hypotheses = HypothesisStage(config, target)
+        self._segmentation = wrap("segmentation", SegmentationStage(config, target))
+        self._hypotheses = wrap("hypotheses", HypothesisStage(config, target))
         self._tracker = RegionTracker(target)
         self._T_cam_target: Float | None = None
         self._is_started = False
-        self.stages = {"segmentation": self._segmentation, "hypotheses": self._hypotheses}
 
     def step(self, frame: Frame) -> Step:
         """Follow; before the first pose, look for one."""

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hat_ros.cache import cached_arrays
-from hat_ros.refinement.contour import COL_WEIGHT, contour_table
+from hat_ros.target.contour import COL_WEIGHT, contour_table
 from hat_ros.target.model import Target
 from hat_ros.target.rendering import Renderer
 from hat_ros.types import Camera

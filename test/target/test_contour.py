@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from hat_ros.refinement.contour import COL_INSIDE, COL_NU, COL_NV, COL_U, COL_V, COL_WEIGHT, COL_Z, contour_table
+from hat_ros.target.contour import COL_INSIDE, COL_NU, COL_NV, COL_U, COL_V, COL_WEIGHT, COL_Z, contour_table
 
 K = np.array([[100.0, 0, 40.0], [0, 100.0, 30.0], [0, 0, 1]])
 

@@ -5,7 +5,7 @@ from shape_scene import spacecraft
 
 from hat_ros.cache import cache_folder
 from hat_ros.geometry import lie
-from hat_ros.hypotheses import bank
+from hat_ros.target import view_bank
 from hat_ros.target.model import target_from_scene
 from hat_ros.target.rendering import create_renderer
 
@@ -22,7 +22,7 @@ def own_cache(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("n_views", [162, 642, 2562])
 def test_views_cover_the_sphere_evenly(n_views):
-    R = bank.view_rotations(n_views)
+    R = view_bank.view_rotations(n_views)
     assert R.shape == (n_views, 3, 3)
     assert lie.is_rigid(lie.transform(R, np.zeros((n_views, 3)))).all()
     directions = -R[:, 2]
@@ -33,13 +33,13 @@ def test_views_cover_the_sphere_evenly(n_views):
 
 def test_a_damaged_cache_is_built_again(target):
     renderer = create_renderer("embree", target)
-    first = bank.load_or_build(target, renderer, 162, 24)
+    first = view_bank.load_or_build(target, renderer, 162, 24)
     spectrum = np.array(first.spectrum)
     file = next(cache_folder().rglob("spectrum.npy"))
     content = bytearray(file.read_bytes())
     content[-9] ^= 255
     file.write_bytes(content)
-    again = bank.load_or_build(target, renderer, 162, 24)
+    again = view_bank.load_or_build(target, renderer, 162, 24)
     assert again.spectrum.tobytes() == spectrum.tobytes()
     assert again.n_angles == 24
 
@@ -47,11 +47,11 @@ def test_a_damaged_cache_is_built_again(target):
 def test_a_read_only_cache_is_no_error(target, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    assert bank.load_or_build(target, create_renderer("embree", target), 162, 24).area.shape == (162,)
+    assert view_bank.load_or_build(target, create_renderer("embree", target), 162, 24).area.shape == (162,)
 
 
 def test_contour_points_lie_on_the_target(target):
-    views = bank.build(target, create_renderer("embree", target), 162, 24)
+    views = view_bank.build(target, create_renderer("embree", target), 162, 24)
     used = views.contour_weight > 0
     points = views.contour_m[used]
     low, high = target.vertices_m.min(axis=0), target.vertices_m.max(axis=0)
@@ -61,7 +61,7 @@ def test_contour_points_lie_on_the_target(target):
 
 def test_moments_of_a_disc():
     y, x = np.mgrid[:100, :120]
-    center, gyration = bank.mask_moments((x - 60) ** 2 + (y - 45) ** 2 <= 30**2)
+    center, gyration = view_bank.mask_moments((x - 60) ** 2 + (y - 45) ** 2 <= 30**2)
     np.testing.assert_allclose(center, [60, 45], atol=1e-6)
     assert gyration == pytest.approx(30 / np.sqrt(2), rel=0.01)
 
@@ -71,18 +71,18 @@ def test_a_sampler_of_many_grids_gives_what_the_whole_image_gives(gyration_px):
     image = np.zeros((120, 160), np.float32)
     image[:50, 60:120] = 0.5
     image[20:70, 90:160] = 1.0
-    sampler = bank.PolarSampler(image)
+    sampler = view_bank.PolarSampler(image)
     for center in ((100.0, 40.0), (70.3, 12.8), (159.0, 60.0)):
         grid = sampler.grid(np.array(center), gyration_px, 24)
         whole = image + np.float32(1e-30)  # nothing is black: nothing is left out
-        np.testing.assert_allclose(grid, bank.polar_grid(whole, np.array(center), gyration_px, 24), atol=1e-6)
+        np.testing.assert_allclose(grid, view_bank.polar_grid(whole, np.array(center), gyration_px, 24), atol=1e-6)
 
 
 def test_the_border_grid_is_that_of_ones():
     ones = np.ones((120, 160), np.float32)
     for center in ((80.0, 60.0), (3.0, 100.0)):
-        inside = bank.border_grid(ones.shape, np.array(center), 30.0, 24)
-        np.testing.assert_allclose(inside, bank.polar_grid(ones, np.array(center), 30.0, 24), atol=0.06)
+        inside = view_bank.border_grid(ones.shape, np.array(center), 30.0, 24)
+        np.testing.assert_allclose(inside, view_bank.polar_grid(ones, np.array(center), 30.0, 24), atol=0.06)
 
 
 def _body_and_boom(scale, boom_px):
@@ -97,25 +97,25 @@ def _body_and_boom(scale, boom_px):
 @pytest.mark.parametrize("scale", [1, 3])
 def test_a_boom_is_left_out_at_any_magnification(scale):
     mask, with_boom = _body_and_boom(scale, boom_px=2 * scale)
-    np.testing.assert_array_equal(bank.without_thin_parts(with_boom)[:, 85 * scale :], False)
-    kept = bank.without_thin_parts(with_boom) & mask
+    np.testing.assert_array_equal(view_bank.without_thin_parts(with_boom)[:, 85 * scale :], False)
+    kept = view_bank.without_thin_parts(with_boom) & mask
     assert kept.sum() > 0.98 * mask.sum()
 
 
 def test_what_is_as_wide_as_a_panel_is_kept_and_so_is_a_body_that_is_thin_all_over():
     panel = _body_and_boom(1, boom_px=12)[1]
-    assert bank.without_thin_parts(panel).sum() > 0.97 * panel.sum()
+    assert view_bank.without_thin_parts(panel).sum() > 0.97 * panel.sum()
     edge_on = np.zeros((120, 200), np.bool_)
     edge_on[60:62, 20:180] = True
-    np.testing.assert_array_equal(bank.without_thin_parts(edge_on), edge_on)
+    np.testing.assert_array_equal(view_bank.without_thin_parts(edge_on), edge_on)
 
 
 def test_a_mask_without_the_boom_has_the_moments_of_the_view_with_it():
     mask, with_boom = _body_and_boom(1, boom_px=2)
-    seen, shown = (bank.mask_moments(bank.without_thin_parts(m)) for m in (mask, with_boom))
+    seen, shown = (view_bank.mask_moments(view_bank.without_thin_parts(m)) for m in (mask, with_boom))
     np.testing.assert_allclose(shown[0], seen[0], atol=0.5)
     assert shown[1] == pytest.approx(seen[1], rel=0.02)
-    assert bank.mask_moments(with_boom)[1] > 1.2 * seen[1]  # so much the boom would have changed it
+    assert view_bank.mask_moments(with_boom)[1] > 1.2 * seen[1]  # so much the boom would have changed it
 
 
 def test_a_bank_without_thin_parts_describes_the_body_that_carries_them():
@@ -123,7 +123,7 @@ def test_a_bank_without_thin_parts_describes_the_body_that_carries_them():
     boom = trimesh.creation.cylinder(0.013, 1.6, transform=lie.transform(np.eye(3), [0.0, 0.0, 0.8]))
     whole = target_from_scene(trimesh.Scene([body, boom]), "with a boom")
     renderer = create_renderer("embree", whole)
-    with_boom, without = (bank.build(whole, renderer, 162, 24, thin_parts) for thin_parts in (True, False))
+    with_boom, without = (view_bank.build(whole, renderer, 162, 24, thin_parts) for thin_parts in (True, False))
     on_boom = [
         np.where(views.contour_m[..., 2] > 0.6, views.contour_weight, 0.0).sum(axis=1) for views in (with_boom, without)
     ]
