@@ -12,12 +12,10 @@ from enum import IntEnum
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float, UInt8
 from hat_ros.errors import CandidateError, FrameError
 from hat_ros.geometry import lie
-
-Float = NDArray[np.float64]
 
 MAX_IMAGE_SIDE_PX = 8192
 
@@ -86,9 +84,9 @@ class Frame:
     """
 
     stamp_ns: int
-    rgb: NDArray[np.uint8]
+    rgb: UInt8
     camera: Camera
-    given_mask: NDArray[np.uint8] | None = None
+    given_mask: UInt8 | None = None
 
     def __post_init__(self) -> None:
         shape = (self.camera.height, self.camera.width, 3)
@@ -110,7 +108,7 @@ class Detection:
         silhouette: True when the mask is the target's outline, False when it is only a filled box.
     """
 
-    mask: NDArray[np.bool_]
+    mask: Bool
     silhouette: bool = True
 
     @cached_property

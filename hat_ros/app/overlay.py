@@ -6,14 +6,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Float, UInt8
 from hat_ros.geometry import lie
 from hat_ros.target.model import Target
 from hat_ros.target.rendering import Renderer, create_renderer
 from hat_ros.types import Camera, TrackState
-
-Image = NDArray[np.uint8]
 
 # RGB.
 STATE_RGB = {
@@ -37,13 +35,13 @@ class OverlayPainter:
 
     def paint(
         self,
-        rgb: Image,
+        rgb: UInt8,
         camera: Camera,
         state: TrackState,
-        pose_row: NDArray[np.float64],
+        pose_row: Float,
         note: str = "",
-        truth_row: NDArray[np.float64] | None = None,
-    ) -> Image:
+        truth_row: Float | None = None,
+    ) -> UInt8:
         """A copy of the image with the estimate drawn in.
 
         Args:
@@ -64,7 +62,7 @@ class OverlayPainter:
         self._label(canvas, f"{state.name} {note}".strip(), STATE_RGB[state])
         return canvas
 
-    def _outline(self, canvas: Image, camera: Camera, T_cam_target: NDArray[np.float64], color: tuple) -> None:
+    def _outline(self, canvas: UInt8, camera: Camera, T_cam_target: Float, color: tuple) -> None:
         scale = min(1.0, _RENDER_SIDE_PX / max(camera.width, camera.height))
         small = camera.crop(0, 0, camera.width, camera.height, scale)
         mask = self._renderer.render(T_cam_target, small, color=False).mask.astype(np.uint8)
@@ -74,7 +72,7 @@ class OverlayPainter:
             points = (contour.astype(np.float64) + 0.5) / scale - 0.5
             cv2.polylines(canvas, [np.rint(points * 2**shift).astype(np.int32)], True, color, 1, cv2.LINE_AA, shift)
 
-    def _axes(self, canvas: Image, camera: Camera, T_cam_target: NDArray[np.float64]) -> None:
+    def _axes(self, canvas: UInt8, camera: Camera, T_cam_target: Float) -> None:
         length = 0.6 * self._target.bounding_radius_m
         tips = np.vstack([np.zeros(3), length * np.eye(3)])
         points = tips @ T_cam_target[:3, :3].T + T_cam_target[:3, 3]
@@ -87,7 +85,7 @@ class OverlayPainter:
             cv2.line(canvas, start, end, _AXES_RGB[axis], 2, cv2.LINE_AA)
 
     @staticmethod
-    def _label(canvas: Image, text: str, color: tuple) -> None:
+    def _label(canvas: UInt8, text: str, color: tuple) -> None:
         size = max(0.45, canvas.shape[1] / 1400)
         origin = (int(10 * size) + 4, int(30 * size) + 4)
         for ink, width in (((0, 0, 0), 4), (color, 1)):
@@ -104,7 +102,7 @@ class VideoFile:
             self.path = stem.with_suffix(".avi")
             self._writer = cv2.VideoWriter(str(self.path), cv2.VideoWriter_fourcc(*"MJPG"), fps, (width, height))
 
-    def add(self, rgb: Image) -> None:
+    def add(self, rgb: UInt8) -> None:
         """Append a frame of the size given at the start."""
         self._writer.write(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
 

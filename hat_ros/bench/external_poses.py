@@ -22,8 +22,8 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Float
 from hat_ros.bench.datasets.image_files import stamp_of
 from hat_ros.bench.evaluation.folder import complete_folder
 from hat_ros.bench.source import Source, SourceSpec
@@ -53,8 +53,8 @@ class ExternalPoses:
         seconds: (N,) processing time of the images for which it is known.
     """
 
-    rows: dict[int, NDArray[np.float64]]
-    seconds: NDArray[np.float64]
+    rows: dict[int, Float]
+    seconds: Float
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def frame_stamps(source: Source, start: int = 0, limit: int | None = None) -> li
     return stamps
 
 
-def match_stamps(stamps: list[int], rows: dict[int, NDArray[np.float64]]) -> dict[int, NDArray[np.float64]]:
+def match_stamps(stamps: list[int], rows: dict[int, Float]) -> dict[int, Float]:
     """Frame stamp -> pose row of the pose stamped within 1 ms of it; the nearest, where there are several."""
     given = np.array(sorted(rows), dtype=np.int64)
     matched = {}
@@ -162,7 +162,7 @@ def match_stamps(stamps: list[int], rows: dict[int, NDArray[np.float64]]) -> dic
     return matched
 
 
-def _write_bag(path: Path, source: Source, stamps: list[int], rows: dict[int, NDArray[np.float64]]) -> None:
+def _write_bag(path: Path, source: Source, stamps: list[int], rows: dict[int, Float]) -> None:
     with ResultBagWriter(path, source.frame_id, source.target.name) as bag:
         for stamp in stamps:
             state = TrackState.TRACKING if stamp in rows else TrackState.LOST
@@ -171,7 +171,7 @@ def _write_bag(path: Path, source: Source, stamps: list[int], rows: dict[int, ND
         bag.write_context(source.recording.camera, source.truth_rows())
 
 
-def _rate(seconds: NDArray[np.float64]) -> float:
+def _rate(seconds: Float) -> float:
     return float(1.0 / seconds.mean()) if len(seconds) and seconds.mean() > 0 else float("nan")
 
 
@@ -219,7 +219,7 @@ def _read_bop(path: Path, text: str, scene: tuple[int, int] | None) -> ExternalP
     table = csv.DictReader(text.splitlines())
     if tuple(table.fieldnames or ()) != _BOP_COLUMNS:
         raise InputError(f"poses {path}: expected the columns {','.join(_BOP_COLUMNS)}, found {table.fieldnames}")
-    best: dict[int, tuple[float, NDArray[np.float64]]] = {}
+    best: dict[int, tuple[float, Float]] = {}
     seconds: dict[int, float] = {}
     seen: set[tuple[int, int]] = set()
     for number, line in enumerate(table, start=2):
@@ -245,7 +245,7 @@ def _read_bop(path: Path, text: str, scene: tuple[int, int] | None) -> ExternalP
     return ExternalPoses({stamp_of(image): row for image, (_, row) in best.items()}, np.array(list(seconds.values())))
 
 
-def _numbers(words: list[str | None], where: str, count: int | None = None) -> NDArray[np.float64]:
+def _numbers(words: list[str | None], where: str, count: int | None = None) -> Float:
     try:
         values = np.array([float(word or "nothing") for word in words])
     except ValueError:

@@ -10,8 +10,8 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Float, UInt8
 from hat_ros.bench.datasets.image_files import ImageRecording
 from hat_ros.bench.datasets.importer import open_dataset, with_annotation_boxes, with_detections
 from hat_ros.bench.datasets.sequence import load_sequence
@@ -117,7 +117,7 @@ class Source:
         bag = isinstance(recording, BagReader)
         return islice(_attempts(recording, masks) if bag else recording.frames(stop, masks), start, stop)
 
-    def masks(self, start: int = 0, limit: int | None = None) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+    def masks(self, start: int = 0, limit: int | None = None) -> Iterator[tuple[int, UInt8 | None]]:
         """Stamps and recorded masks of the same frames, images left alone."""
         recording, stop = self.recording, None if limit is None else start + limit
         if isinstance(recording, BagReader):
@@ -134,7 +134,7 @@ class Source:
         """``header.frame_id`` of the images."""
         return self.recording.frame_id if isinstance(self.recording, BagReader) else "camera"
 
-    def truth_rows(self) -> dict[int, NDArray[np.float64]]:
+    def truth_rows(self) -> dict[int, Float]:
         """Stamp -> true pose row (7,), empty when unknown."""
         if isinstance(self.recording, BagReader):
             return self.recording.truth_rows()
@@ -152,7 +152,7 @@ def _attempts(bag: BagReader, masks: bool) -> Iterator[Frame | FrameError]:
             yield error
 
 
-def _masks(bag: BagReader) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+def _masks(bag: BagReader) -> Iterator[tuple[int, UInt8 | None]]:
     """Stamps and masks of a bag; one that cannot be decoded says nothing."""
     for packet in bag.packets():
         mask = None
@@ -161,7 +161,7 @@ def _masks(bag: BagReader) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
         yield packet.stamp_ns, mask
 
 
-def _mask_of(packet: Packet, bag: BagReader) -> NDArray[np.uint8] | None:
+def _mask_of(packet: Packet, bag: BagReader) -> UInt8 | None:
     return packet.mask and decode_mask(deserialize(packet.mask, "sensor_msgs/msg/Image", bag.path))
 
 

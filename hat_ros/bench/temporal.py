@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float, Int
 from hat_ros.bench.methods.smoothing import solve_offline
 from hat_ros.config import HatConfig
 from hat_ros.core.fusion import FusionStage
@@ -22,7 +22,7 @@ from hat_ros.core.published_fusion import PublishedFusion
 from hat_ros.core.selector import SelectorStage
 from hat_ros.errors import CandidateError, InputError
 from hat_ros.geometry import lie
-from hat_ros.types import Camera, Candidates, Float, Frame, Motion, TrackState
+from hat_ros.types import Camera, Candidates, Frame, Motion, TrackState
 
 MAX_UNPACKED_BYTES = 4 << 30
 
@@ -43,7 +43,7 @@ class Observations:
     """
 
     slam: Float
-    key: NDArray[np.bool_]
+    key: Bool
     poses: Float
     scores: Float
     box_area_px: Float | None = None
@@ -111,10 +111,10 @@ class TemporalResult:
     """
 
     T_cam_target: Float
-    chosen: NDArray[np.int64]
-    accepted: NDArray[np.bool_]
-    resets: NDArray[np.int64]
-    held: NDArray[np.bool_]
+    chosen: Int
+    accepted: Bool
+    resets: Int
+    held: Bool
 
 
 def run_temporal(observations: Observations, config: HatConfig) -> TemporalResult:

@@ -15,12 +15,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float
 from hat_ros.config import AlignmentConfig
 from hat_ros.core.joint_history import JointHistory, relative_rotvecs
 from hat_ros.geometry import lie
-from hat_ros.types import Alignment, Float
+from hat_ros.types import Alignment
 
 # A regression slope at or below zero is no similarity: the cost then falls towards scale zero, which this stands for.
 _MIN_SCALE = 1e-9
@@ -114,7 +114,7 @@ class SlamAlignment:
         )
 
 
-def _fit(history: JointHistory, rows: NDArray[np.bool_], scale: float, quat_xyzw: Float) -> _Fit:
+def _fit(history: JointHistory, rows: Bool, scale: float, quat_xyzw: Float) -> _Fit:
     """Minimum of eq. (alignmentfit) over the chosen rows and the fold; the start scale stays if nothing tells it."""
     moments = history.moments(rows)
     extent_sq = moments.count * float(moments.mean_slam @ moments.mean_slam) + moments.spread

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from hat_ros.array_types import Float
 from hat_ros.geometry import lie
-from hat_ros.types import Float
 
 # Effective number of residuals that the running means remember.
 _MEMORY = 20

@@ -12,13 +12,14 @@ from typing import Protocol
 
 import numpy as np
 
+from hat_ros.array_types import Float
 from hat_ros.config import HatConfig
 from hat_ros.core.alignment import SlamAlignment
 from hat_ros.core.covariance import ResidualCovariance
 from hat_ros.core.published_fusion import Fused
 from hat_ros.core.selector import rotation_increment
 from hat_ros.geometry import lie
-from hat_ros.types import Detection, Estimate, Float, Frame, Motion, Selection, TrackState
+from hat_ros.types import Detection, Estimate, Frame, Motion, Selection, TrackState
 
 _NO_POSE = np.full(7, np.nan)
 _NO_COVARIANCE = np.full((6, 6), np.nan)

@@ -8,11 +8,11 @@ non-finite score or a pose that is no rigid transform is an error.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float
 from hat_ros.errors import CandidateError
 from hat_ros.geometry import lie
-from hat_ros.types import Candidates, Float
+from hat_ros.types import Candidates
 
 MIN_RANGE_M = 1e-3
 MAX_RANGE_M = 100.0
@@ -60,13 +60,13 @@ def guard_candidates(candidates: Candidates, drop: bool) -> Candidates:
     return Candidates(rows, np.where(keep, candidates.log_score, -np.inf), candidates.box_xyxy)
 
 
-def _rigid_rows(pose_rows: Float) -> NDArray[np.bool_]:
+def _rigid_rows(pose_rows: Float) -> Bool:
     finite = np.isfinite(pose_rows).all(axis=1)
     norm = np.linalg.norm(np.where(finite[:, None], pose_rows[:, 3:], 0.0), axis=1)
     return finite & (np.abs(norm - 1.0) < _QUAT_NORM_TOLERANCE)
 
 
-def _insist(candidates: Candidates, valid_pose: NDArray[np.bool_]) -> None:
+def _insist(candidates: Candidates, valid_pose: Bool) -> None:
     finite_score = np.isfinite(candidates.log_score)
     if not finite_score.all():
         index = int(np.argmin(finite_score))

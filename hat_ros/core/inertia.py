@@ -13,8 +13,8 @@ in the next frame, and a quarter in the one after (tried: the error doubles at v
 
 from __future__ import annotations
 
+from hat_ros.array_types import Float
 from hat_ros.geometry import lie
-from hat_ros.types import Float
 
 
 class InertialPrior:

@@ -9,10 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float
 from hat_ros.geometry import lie
-from hat_ros.types import Float
 
 _MEAN_TOLERANCE_RAD = 1e-14
 _MEAN_MAX_STEPS = 200
@@ -115,11 +114,11 @@ class JointHistory:
         row[10:13] = -T_cam_target[:3, :3].T @ T_cam_target[:3, 3]
         self._n += 1
 
-    def moments(self, rows: NDArray[np.bool_]) -> Moments:
+    def moments(self, rows: Bool) -> Moments:
         """Moments of the chosen rows and everything folded."""
         return self._folded_moments.merged(Moments.of(self.slam_position[rows], self.camera_position[rows]))
 
-    def rotation_mean(self, rows: NDArray[np.bool_], start_quat: Float) -> Float:
+    def rotation_mean(self, rows: Bool, start_quat: Float) -> Float:
         """(4,) mean of the chosen rows' rotations and everything folded, from ``start_quat``."""
         quats, weights = self.relative_quat[rows], np.ones(np.count_nonzero(rows))
         if self.folded_count:

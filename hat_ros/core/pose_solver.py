@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hat_ros.array_types import Float
 from hat_ros.geometry import lie
-from hat_ros.types import Float
 
 _MAX_STEPS = 100
 _MAX_HALVINGS = 30

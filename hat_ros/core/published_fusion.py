@@ -10,13 +10,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hat_ros.array_types import Float
 from hat_ros.config import FusionConfig, HatConfig
 from hat_ros.core.alignment import SlamAlignment
 from hat_ros.core.inertia import InertialPrior
 from hat_ros.core.pose_solver import PoseProblem, solve_pose
 from hat_ros.core.selector import box_area_px
 from hat_ros.geometry import lie
-from hat_ros.types import Detection, Float, Frame, Motion, Selection
+from hat_ros.types import Detection, Frame, Motion, Selection
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from hat_ros.array_types import Float
 from hat_ros.config import SelectorConfig
 from hat_ros.geometry import lie
-from hat_ros.types import Candidates, Float, Motion, Selection
+from hat_ros.types import Candidates, Motion, Selection
 
 
 class SelectorStage:

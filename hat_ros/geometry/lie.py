@@ -13,9 +13,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from hat_ros.array_types import Bool, Float
 
 # Below this squared angle sin(x)/x and its relatives are taken from their series: the next term is under 1e-17.
 _SMALL_ANGLE_SQ = 1e-8
@@ -24,7 +23,7 @@ _SMALL_ANGLE_SQ_JACOBIAN = 1e-5
 _EYE = np.eye(3)
 
 
-def hat(v: Array) -> Array:
+def hat(v: Float) -> Float:
     """Skew matrix ``[v]x``: (..., 3) -> (..., 3, 3)."""
     v = np.asarray(v, dtype=np.float64)
     out = np.zeros(v.shape[:-1] + (3, 3))
@@ -34,7 +33,7 @@ def hat(v: Array) -> Array:
     return out
 
 
-def so3_exp(rotvec: Array) -> Array:
+def so3_exp(rotvec: Float) -> Float:
     """Rotation matrix of a rotation vector (eq. 132): (..., 3) -> (..., 3, 3)."""
     rotvec = np.asarray(rotvec, dtype=np.float64)
     if rotvec.ndim == 1:
@@ -49,7 +48,7 @@ def so3_exp(rotvec: Array) -> Array:
     return np.eye(3) + a[..., None, None] * k + b[..., None, None] * (k @ k)
 
 
-def so3_log(R: Array) -> Array:
+def so3_log(R: Float) -> Float:
     """Rotation vector of a rotation matrix, angle in [0, pi]: (..., 3, 3) -> (..., 3).
 
     Goes through the quaternion, which stays well conditioned up to and at 180 degrees.
@@ -66,7 +65,7 @@ def so3_log(R: Array) -> Array:
     return factor[..., None] * q[..., :3]
 
 
-def so3_right_jacobian_inverse(rotvec: Array) -> Array:
+def so3_right_jacobian_inverse(rotvec: Float) -> Float:
     """J_r^-1 (eq. 144): Log(Exp(v) Exp(d)) = v + J_r^-1(v) d + O(d^2). (..., 3) -> (..., 3, 3)."""
     rotvec = np.asarray(rotvec, dtype=np.float64)
     k = hat(rotvec)
@@ -84,7 +83,7 @@ def so3_right_jacobian_inverse(rotvec: Array) -> Array:
     return _EYE + 0.5 * k + factor[..., None, None] * (k @ k)
 
 
-def rotation_angle(R: Array) -> Array:
+def rotation_angle(R: Float) -> Float:
     """Smallest rotation angle in radians, in [0, pi]: (..., 3, 3) -> (...)."""
     q = quat_from_matrix(R)
     if q.ndim == 1:
@@ -92,12 +91,12 @@ def rotation_angle(R: Array) -> Array:
     return 2.0 * np.arctan2(np.sqrt(np.einsum("...i,...i->...", q[..., :3], q[..., :3])), q[..., 3])
 
 
-def angle_between(R_a: Array, R_b: Array) -> Array:
+def angle_between(R_a: Float, R_b: Float) -> Float:
     """Angle in radians between two rotations: (..., 3, 3), (..., 3, 3) -> (...)."""
     return rotation_angle(np.asarray(R_a) @ np.swapaxes(np.asarray(R_b), -1, -2))
 
 
-def quat_from_matrix(R: Array) -> Array:
+def quat_from_matrix(R: Float) -> Float:
     """Unit quaternion xyzw with qw >= 0 of a rotation matrix: (..., 3, 3) -> (..., 4)."""
     R = np.asarray(R, dtype=np.float64)
     if R.ndim == 2:
@@ -115,7 +114,7 @@ def quat_from_matrix(R: Array) -> Array:
     return np.where(q[..., 3:] < 0, -q, q)
 
 
-def matrix_from_quat(quat_xyzw: Array) -> Array:
+def matrix_from_quat(quat_xyzw: Float) -> Float:
     """Rotation matrix of a quaternion, normalised here: (..., 4) -> (..., 3, 3)."""
     q = np.asarray(quat_xyzw, dtype=np.float64)
     if q.ndim == 1:
@@ -131,7 +130,7 @@ def matrix_from_quat(quat_xyzw: Array) -> Array:
     return R
 
 
-def transform(R: Array, t: Array) -> Array:
+def transform(R: Float, t: Float) -> Float:
     """Rigid transform from its parts: (..., 3, 3), (..., 3) -> (..., 4, 4)."""
     R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
     T = np.zeros(R.shape[:-2] + (4, 4))
@@ -139,25 +138,25 @@ def transform(R: Array, t: Array) -> Array:
     return T
 
 
-def inverse(T: Array) -> Array:
+def inverse(T: Float) -> Float:
     """Inverse of a rigid transform: (..., 4, 4) -> (..., 4, 4)."""
     R_t = np.swapaxes(T[..., :3, :3], -1, -2)
     return transform(R_t, -(R_t @ T[..., :3, 3:])[..., 0])
 
 
-def row_from_matrix(T: Array) -> Array:
+def row_from_matrix(T: Float) -> Float:
     """Pose row ``[x y z qx qy qz qw]``, qw >= 0: (..., 4, 4) -> (..., 7)."""
     T = np.asarray(T, dtype=np.float64)
     return np.concatenate([T[..., :3, 3], quat_from_matrix(T[..., :3, :3])], axis=-1)
 
 
-def matrix_from_row(row: Array) -> Array:
+def matrix_from_row(row: Float) -> Float:
     """Rigid transform of a pose row; NaN rows give NaN matrices: (..., 7) -> (..., 4, 4)."""
     row = np.asarray(row, dtype=np.float64)
     return transform(matrix_from_quat(row[..., 3:]), row[..., :3])
 
 
-def is_rigid(T: Array, tolerance: float = 1e-4) -> NDArray[np.bool_]:
+def is_rigid(T: Float, tolerance: float = 1e-4) -> Bool:
     """Whether each matrix is finite, has a proper rotation and the last row 0 0 0 1: (..., 4, 4) -> (...) bool."""
     T = np.asarray(T, dtype=np.float64)
     finite = np.isfinite(T).all(axis=(-1, -2))
@@ -172,7 +171,7 @@ def is_rigid(T: Array, tolerance: float = 1e-4) -> NDArray[np.bool_]:
 # numpy's overhead. Same formulas on plain floats, agreeing with the batched ones to the last bit or two.
 
 
-def _so3_exp_single(rotvec: Array) -> Array:
+def _so3_exp_single(rotvec: Float) -> Float:
     x, y, z = rotvec.tolist()
     angle_sq = x * x + y * y + z * z
     if angle_sq < _SMALL_ANGLE_SQ:
@@ -189,7 +188,7 @@ def _so3_exp_single(rotvec: Array) -> Array:
     )
 
 
-def _quat_from_matrix_single(R: Array) -> Array:
+def _quat_from_matrix_single(R: Float) -> Float:
     (m00, m01, m02), (m10, m11, m12), (m20, m21, m22) = R.tolist()
     squares = (1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22, 1 + m00 + m11 + m22)
     best = max(range(4), key=squares.__getitem__)
@@ -205,7 +204,7 @@ def _quat_from_matrix_single(R: Array) -> Array:
     return np.array([x / norm, y / norm, z / norm, w / norm])
 
 
-def _matrix_from_quat_single(quat_xyzw: Array) -> Array:
+def _matrix_from_quat_single(quat_xyzw: Float) -> Float:
     x, y, z, w = quat_xyzw.tolist()
     norm = math.sqrt(x * x + y * y + z * z + w * w)
     if norm == 0.0:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from hat_ros.array_types import Float
 
 
 @njit(cache=True, nogil=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, UInt8
 from hat_ros.segmentation.boundary import refine_outline
 from hat_ros.segmentation.region import ColorModels, graph_cut, tidy
 
@@ -20,7 +20,7 @@ _MIN_AREA_PX = 30
 _ITERATIONS = 3
 
 
-def silhouette_in_box(rgb: NDArray[np.uint8], box_mask: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+def silhouette_in_box(rgb: UInt8, box_mask: Bool) -> Bool | None:
     """The target's silhouette inside a box, or None when nothing stands out there.
 
     Args:

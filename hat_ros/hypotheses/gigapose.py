@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hat_ros.array_types import Bool, Float, UInt8
 from hat_ros.cache import cached_arrays
 from hat_ros.config import HatConfig
 from hat_ros.hypotheses.megapose import MegaPose
@@ -95,7 +96,7 @@ class GigaPoseHypotheses:
         return gp.best_similarity(gp.patch_px(matches.template), gp.patch_px(matches.image), scale, inplane)[0]
 
 
-def letterbox(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+def letterbox(mask: Bool) -> Float:
     """(3, 3) affine from image to crop pixels: the tight box, longer side 224, the shorter one centred."""
     rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     size = np.array([cols[-1] + 1 - cols[0], rows[-1] + 1 - rows[0]])
@@ -104,7 +105,7 @@ def letterbox(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
     return np.array([[scale, 0, shift[0]], [0, scale, shift[1]], [0, 0, 1.0]])
 
 
-def cut(image: NDArray[np.uint8], mask: NDArray[np.bool_], M: NDArray[np.float64]) -> NDArray[np.uint8]:
+def cut(image: UInt8, mask: Bool, M: Float) -> UInt8:
     """Masked crop by ``M`` with nearest sampling, zeros elsewhere: (H, W, 3) and (H, W) -> (224, 224, 4), mask last.
 
     Crop pixel i shows image pixel floor(M^-1 i), without the half pixel, as in the reference.

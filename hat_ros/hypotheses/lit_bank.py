@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hat_ros.array_types import Float, Float32
 from hat_ros.cache import cached_arrays
 from hat_ros.refinement.sunlight import brightness
 from hat_ros.refinement.view import Surfels, TargetViewer
@@ -51,7 +52,7 @@ class LitBank(ViewBank):
         to_sun_cam: (V, 3) unit direction to the sun of each view, in the view's camera frame.
     """
 
-    to_sun_cam: NDArray[np.float64]
+    to_sun_cam: Float
 
 
 def load_or_build_lit(viewer: TargetViewer, n_angles: int) -> LitBank:
@@ -61,7 +62,7 @@ def load_or_build_lit(viewer: TargetViewer, n_angles: int) -> LitBank:
     return LitBank(**arrays)
 
 
-def sun_directions() -> NDArray[np.float64]:
+def sun_directions() -> Float:
     """(S, 3) unit directions to the suns of the bank, camera frame (z away from the camera)."""
     out = []
     for phase_deg, count in _SUNS:
@@ -71,7 +72,7 @@ def sun_directions() -> NDArray[np.float64]:
     return np.array(out)
 
 
-def subdued(light: NDArray[np.float32]) -> NDArray[np.float32]:
+def subdued(light: Float32) -> Float32:
     """Brightness as it is compared, of any scale."""
     return np.sqrt(light)
 
@@ -106,7 +107,7 @@ def build_lit(viewer: TargetViewer, n_angles: int) -> LitBank:
 class _OneView:
     """The target from one direction, to be put under many suns."""
 
-    def __init__(self, viewer: TargetViewer, R: NDArray[np.float64], distance_m: float) -> None:
+    def __init__(self, viewer: TargetViewer, R: Float, distance_m: float) -> None:
         focal = 0.5 * (_RENDER_PX - 6) / np.tan(np.arcsin(1.0 / _DISTANCE_RADII))
         middle = _RENDER_PX / 2 - 0.5
         self.camera = Camera(np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]]), _RENDER_PX, _RENDER_PX)
@@ -124,7 +125,7 @@ class _OneView:
             depth.reshape(self._shape), mask.reshape(self._shape), self.camera.K, 4 * CONTOUR_POINTS
         )
 
-    def image(self, to_sun_cam: NDArray[np.float64]) -> NDArray[np.float32]:
+    def image(self, to_sun_cam: Float) -> Float32:
         """(side, side) encoded brightness, 0 to 1."""
         seen = self.seen
         to_sun = (to_sun_cam @ self._R).astype(np.float32)
@@ -133,7 +134,7 @@ class _OneView:
         image[seen.pixel] = self._albedo * brightness(cosine)
         return image.reshape(self._shape)
 
-    def contour(self, image: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def contour(self, image: Float32) -> tuple[Float, Float]:
         """Contour points (P, 3) in the target frame that such light shows, and the length each stands for (P,)."""
         table = self._table
         inner = np.rint(table[:, [COL_V, COL_U]] - table[:, [COL_NV, COL_NU]]).astype(np.intp)
@@ -142,9 +143,7 @@ class _OneView:
         return (table[:, :3] - self._t) @ self._R, table[:, COL_WEIGHT]
 
 
-def _describe(
-    image: NDArray[np.float32], camera: Camera, n_angles: int
-) -> tuple[NDArray[np.complex64], NDArray[np.float64], float]:
+def _describe(image: Float32, camera: Camera, n_angles: int) -> tuple[NDArray[np.complex64], Float, float]:
     """Spectrum (F, rings) of unit norm, centroid and radius of gyration in tangent units."""
     center_px, gyration_px = image_moments(image)
     grid = polar_grid(image, center_px, gyration_px, n_angles)

@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float, Float32
 from hat_ros.geometry import lie
 from hat_ros.hypotheses.lit_bank import subdued
 from hat_ros.target.view_bank import (
@@ -45,7 +46,7 @@ _CUT_ASSUMPTIONS = tuple(
 class Placement:
     """An assumption about the whole silhouette: its centroid and radius of gyration in pixels."""
 
-    center_px: NDArray[np.float64]
+    center_px: Float
     gyration_px: float
 
 
@@ -53,17 +54,17 @@ class Placement:
 class ShapeMatches:
     """Coarse poses, best first: T_cam_target (N, 4, 4), view index (N,), shape score (N,) in 0..1."""
 
-    T_cam_target: NDArray[np.float64]
+    T_cam_target: Float
     view: NDArray[np.intp]
-    score: NDArray[np.float64]
+    score: Float
 
 
-def whole_placement(mask: NDArray[np.bool_]) -> list[Placement]:
+def whole_placement(mask: Bool) -> list[Placement]:
     """The mask taken as the whole silhouette."""
     return [Placement(*mask_moments(mask))]
 
 
-def cut_placements(mask: NDArray[np.bool_]) -> list[Placement]:
+def cut_placements(mask: Bool) -> list[Placement]:
     """The mask continues beyond the image border: centroids further out, larger sizes."""
     center, gyration = mask_moments(mask)
     outward = np.zeros(2)
@@ -79,7 +80,7 @@ def cut_placements(mask: NDArray[np.bool_]) -> list[Placement]:
     return [Placement(center + shift * gyration * outward, scale * gyration) for shift, scale in _CUT_ASSUMPTIONS]
 
 
-def partial_placements(mask: NDArray[np.bool_]) -> list[Placement]:
+def partial_placements(mask: Bool) -> list[Placement]:
     """Parts of the target are missing from the mask on an unknown side."""
     center, gyration = mask_moments(mask)
     angles = np.arange(8) * (np.pi / 4)
@@ -92,12 +93,12 @@ def partial_placements(mask: NDArray[np.bool_]) -> list[Placement]:
 
 def match_shape(
     bank: ViewBank,
-    mask: NDArray[np.bool_],
+    mask: Bool,
     placements: list[Placement],
     camera: Camera,
     n_best: int,
     separation_deg: float,
-    center_m: NDArray[np.float64],
+    center_m: Float,
 ) -> ShapeMatches:
     """The best matches whose orientations differ by at least ``separation_deg``.
 
@@ -116,11 +117,11 @@ def match_shape(
 
 def match_light(
     bank: ViewBank,
-    light: NDArray[np.float32],
+    light: Float32,
     camera: Camera,
     n_best: int,
     separation_deg: float,
-    center_m: NDArray[np.float64],
+    center_m: Float,
 ) -> ShapeMatches:
     """Correlation with a bank of brightness: the best distinct matches.
 
@@ -139,12 +140,12 @@ def match_light(
 
 def _best_matches(
     bank: ViewBank,
-    score: NDArray[np.float32],
+    score: Float32,
     placements: list[Placement],
     camera: Camera,
     n_best: int,
     separation_deg: float,
-    center_m: NDArray[np.float64],
+    center_m: Float,
 ) -> ShapeMatches:
     """The best of all scores (placements, views, angles) that are distinct."""
     peaks = _peaks(score)
@@ -160,7 +161,7 @@ def _best_matches(
     return ShapeMatches(T[keep], view[keep], best[order][keep].astype(np.float64))
 
 
-def distinct(R: NDArray[np.float64], n_best: int, separation_rad: float) -> NDArray[np.intp]:
+def distinct(R: Float, n_best: int, separation_rad: float) -> NDArray[np.intp]:
     """Indices of rotations (N, 3, 3), in order, each at least so far from all before it."""
     quats = lie.quat_from_matrix(R)
     limit = np.cos(0.5 * separation_rad)
@@ -175,7 +176,7 @@ def distinct(R: NDArray[np.float64], n_best: int, separation_rad: float) -> NDAr
     return np.array(keep, dtype=np.intp)
 
 
-def _scores(bank: ViewBank, mask: NDArray[np.bool_], placements: list[Placement]) -> NDArray[np.float32]:
+def _scores(bank: ViewBank, mask: Bool, placements: list[Placement]) -> Float32:
     """Tversky overlap (placements, views, angles) between mask and view, over what lies inside the image."""
     sampler, n_angles = PolarSampler(mask.astype(np.float32)), bank.n_angles
     grids = np.stack([sampler.grid(p.center_px, p.gyration_px, n_angles) for p in placements])
@@ -209,7 +210,7 @@ def rehearse(bank: ViewBank) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _peaks(score: NDArray[np.float32]) -> NDArray[np.intp]:
+def _peaks(score: Float32) -> NDArray[np.intp]:
     """Flat indices of the scores (P, V, angles) that no neighbouring angle of the same view exceeds."""
     n_placements, n_views, n_angles = score.shape
     out, count = np.empty(score.size, np.intp), 0
@@ -223,7 +224,7 @@ def _peaks(score: NDArray[np.float32]) -> NDArray[np.intp]:
     return out[:count]
 
 
-def _correlate(bank: ViewBank, grids: NDArray[np.float32]) -> NDArray[np.float32]:
+def _correlate(bank: ViewBank, grids: Float32) -> Float32:
     """Inner products of grids (P, angles, rings) with every view turned by every angle: (P, V, angles)."""
     spectrum = np.fft.rfft(grids, axis=1).astype(np.complex64).transpose(1, 0, 2)  # (F, P, rings)
     real, imag = np.ascontiguousarray(spectrum.real), np.ascontiguousarray(spectrum.imag)
@@ -232,9 +233,7 @@ def _correlate(bank: ViewBank, grids: NDArray[np.float32]) -> NDArray[np.float32
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
-def _cross_spectrum(
-    views: NDArray[np.complex64], real: NDArray[np.float32], imag: NDArray[np.float32]
-) -> NDArray[np.complex64]:
+def _cross_spectrum(views: NDArray[np.complex64], real: Float32, imag: Float32) -> NDArray[np.complex64]:
     """Sum over rings of ``conj(views) * query``: (F, V, rings), twice (F, P, rings) -> (P, V, F).
 
     Compiled rather than left to BLAS: many small products, whose threads cost more than they save. The sums may be
@@ -261,10 +260,10 @@ def _poses(
     placements: list[Placement],
     placement: NDArray[np.intp],
     view: NDArray[np.intp],
-    angle_rad: NDArray[np.float64],
+    angle_rad: Float,
     camera: Camera,
-    center_m: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    center_m: Float,
+) -> Float:
     """Poses that put each view's silhouette, turned by its angle, on its placement: (N, 4, 4)."""
     K = camera.K
     focal = np.sqrt(K[0, 0] * K[1, 1])

@@ -15,10 +15,10 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
+from hat_ros.array_types import Float, UInt8
 from hat_ros.cache import cached_arrays
 from hat_ros.config import HatConfig
 from hat_ros.geometry import lie
@@ -129,7 +129,7 @@ class MegaPoseHypotheses:
             self._views = camera, torch.from_numpy(np.array(arrays["views"])).to(self._megapose.runtime.device)
         return self._views[1]
 
-    def _render_coarse(self, camera: Camera) -> NDArray[np.uint8]:
+    def _render_coarse(self, camera: Camera) -> UInt8:
         LOG.info("rendering %d coarse views, once per CAD model and camera", len(self._grid))
         runtime, points = self._megapose.runtime, self._megapose.points
         half = _CANONICAL_HALF_SIZE * min(camera.width, camera.height)
@@ -154,7 +154,7 @@ class TorchViews:
         views = torch.from_numpy(self.render_bytes(T_cam_target, K)).to(self._runtime.device)
         return views.float() / 255
 
-    def render_bytes(self, T_cam_target: Tensor, K: Tensor) -> NDArray[np.uint8]:
+    def render_bytes(self, T_cam_target: Tensor, K: Tensor) -> UInt8:
         """(B, 4, 4), (B, 3, 3) -> (B, 6, 240, 320) uint8."""
         poses, cameras = T_cam_target.double().cpu().numpy(), K.double().cpu().numpy()
         views = self._renderer.render_many(poses, cameras, _CROP_SIZE)
@@ -180,7 +180,7 @@ def crop_points(target: Target, runtime: Runtime) -> mp.CropPoints:
     return mp.CropPoints(runtime.tensor(points[draw[0]]), runtime.tensor(points[draw[1]]))
 
 
-def padded_box(box_xyxy: NDArray[np.float64], padding: float, camera: Camera) -> NDArray[np.float64]:
+def padded_box(box_xyxy: Float, padding: float, camera: Camera) -> Float:
     """Box (4,) grown by a share of its size on each side and clipped to the image."""
     margin = padding * (box_xyxy[2:] - box_xyxy[:2])
     size = np.array([camera.width, camera.height], dtype=np.float64)

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from hat_ros.array_types import Float, Float32, Int
 from hat_ros.cache import cached_arrays
 from hat_ros.config import HatConfig, PicoPoseConfig
 from hat_ros.geometry import lie
@@ -131,13 +132,13 @@ class PicoPoseHypotheses:
 
 
 def solve_pose(
-    source: NDArray[np.int64],
-    at: NDArray[np.int64],
-    points_m: NDArray[np.float32],
-    M_image: NDArray[np.float64],
-    K: NDArray[np.float64],
+    source: Int,
+    at: Int,
+    points_m: Float32,
+    M_image: Float,
+    K: Float,
     settings: PicoPoseConfig,
-) -> tuple[NDArray[np.float64], float] | None:
+) -> tuple[Float, float] | None:
     """EPnP-RANSAC over correspondences: (4, 4) pose and inlier share, or None when there is no pose.
 
     Args:

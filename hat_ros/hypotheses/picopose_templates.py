@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float, Float32, UInt8
 from hat_ros.geometry import lie
 from hat_ros.target.embree import EmbreeRenderer, pixel_rays
 from hat_ros.target.model import Target
@@ -39,7 +40,7 @@ class SquareCrop:
     side: int
 
     @property
-    def M(self) -> NDArray[np.float64]:
+    def M(self) -> Float:
         """(3, 3) affine from image pixels to crop pixels (pixel edges at integers, as the published crops)."""
         s = CROP_PX / self.side
         return np.array([[s, 0, -s * self.x0], [0, s, -s * self.y0], [0, 0, 1.0]])
@@ -48,17 +49,17 @@ class SquareCrop:
         """The square at the image's own resolution."""
         return image[self.y0 : self.y0 + self.side, self.x0 : self.x0 + self.side]
 
-    def resize(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def resize(self, image: UInt8) -> Float32:
         """(H, W, 3) RGB -> (3, 224, 224) BGR in [0, 1], bilinear."""
         cut = np.ascontiguousarray(self.cut(image)[..., ::-1], np.float32) / 255
         return cv2.resize(cut, (CROP_PX, CROP_PX), interpolation=cv2.INTER_LINEAR).transpose(2, 0, 1)
 
-    def resize_mask(self, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    def resize_mask(self, mask: Bool) -> Float32:
         """(H, W) -> (224, 224) of 0 and 1, nearest."""
         return _nearest(self.cut(mask).astype(np.float32), CROP_PX)
 
 
-def square_crop(mask: NDArray[np.bool_]) -> SquareCrop:
+def square_crop(mask: Bool) -> SquareCrop:
     """Square around a mask's tight box, as large as its longer side, shifted to stay inside the image.
 
     ``mask`` is (H, W) with at least one pixel set.
@@ -84,14 +85,14 @@ class Templates:
         points_m: (N, 64, 64, 3) float32 target-frame surface point of each crop cell, NaN off the target.
     """
 
-    crops: NDArray[np.float32]
-    masks: NDArray[np.float32]
-    M: NDArray[np.float64]
-    T_cam_target: NDArray[np.float64]
-    points_m: NDArray[np.float32]
+    crops: Float32
+    masks: Float32
+    M: Float
+    T_cam_target: Float
+    points_m: Float32
 
 
-def template_poses(target: Target) -> NDArray[np.float64]:
+def template_poses(target: Target) -> Float:
     """(162, 4, 4) poses that centre the target's box and show its bounding ball about 360 px large."""
     R = look_at_origin(icosphere(2))
     distance = 2 * target.bounding_radius_m * TEMPLATE_K[1, 1] / (2 * _PIXELS_PER_RADIUS)
@@ -119,9 +120,7 @@ def render_templates(target: Target) -> Templates:
     return Templates(np.stack(crops), np.stack(masks), np.stack(Ms), poses, np.stack(points))
 
 
-def _surface_points(
-    depth_m: NDArray[np.float32], crop: SquareCrop, camera: Camera, T_cam_target: NDArray[np.float64]
-) -> NDArray[np.float32]:
+def _surface_points(depth_m: Float32, crop: SquareCrop, camera: Camera, T_cam_target: Float) -> Float32:
     """(64, 64, 3) target-frame points under the crop's cells, NaN off the target."""
     rays = pixel_rays(camera, np.arange(camera.width), np.arange(camera.height))
     depth = _nearest(crop.cut(depth_m), POINT_CELLS)

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Float, Float32
 from hat_ros.refinement.mask_field import VISIBLE_LEVEL, MaskField
 from hat_ros.refinement.pose_fitter import Fit
 from hat_ros.refinement.sunlight import LightField
@@ -80,7 +80,7 @@ class Scorer:
         dark = np.count_nonzero(outside & (around < VISIBLE_LEVEL))
         return dark >= _DARK_SHARE * max(np.count_nonzero(outside), 1)
 
-    def light(self) -> NDArray[np.float32] | None:
+    def light(self) -> Float32 | None:
         """(H, W) what shines in and around the mask, without the sky's level; None when that is next to nothing."""
         around = cv2.dilate(self.field.mask.astype(np.uint8), np.ones((_HALO_PX, _HALO_PX), np.uint8))
         outside = self.luma[around == 0]
@@ -94,7 +94,7 @@ class Scorer:
         outline = max(outline_px, 1.0)
         return areas.extra / outline, areas.missing / outline, areas.hidden / outline
 
-    def view(self, fit: Fit, to_sun_cam: NDArray[np.float64] | None = None) -> View | None:
+    def view(self, fit: Fit, to_sun_cam: Float | None = None) -> View | None:
         """What a refined pose looks like, or its part that a sun shines on; None when it cannot be seen."""
         if fit.twist_px <= _SAME_VIEW_PX:
             return fit.view.shifted(fit.shift_px)

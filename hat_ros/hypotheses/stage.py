@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from hat_ros.array_types import Float
 from hat_ros.config import HatConfig
 from hat_ros.core.cadence import Cadence
 from hat_ros.core.guard import guard_candidates
 from hat_ros.core.keyframes import KeyframeSchedule
 from hat_ros.stages import create_backend
 from hat_ros.target.model import Target
-from hat_ros.types import Candidates, Detection, Float, Frame, PosePrior
+from hat_ros.types import Candidates, Detection, Frame, PosePrior
 
 # Between successive detections of one thing little changes: boxes overlap by this, intersection over union, and
 # neither mask has less than this share of the other's area.

@@ -26,8 +26,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float
 from hat_ros.config import HatConfig
 from hat_ros.errors import ConfigError
 from hat_ros.geometry import lie
@@ -101,8 +101,8 @@ class Aligned:
         score: its shape score.
     """
 
-    T_cam_target: NDArray[np.float64]
-    to_sun_cam: NDArray[np.float64] | None
+    T_cam_target: Float
+    to_sun_cam: Float | None
     score: float
 
 
@@ -111,7 +111,7 @@ class Compared:
     """Views, and the mask (H, W) bool that they are compared with: both with their thin parts, or both without."""
 
     bank: ViewBank
-    mask: NDArray[np.bool_]
+    mask: Bool
 
 
 class TemplateHypotheses:
@@ -217,7 +217,7 @@ class TemplateHypotheses:
         field: MaskField,
         n_coarse: int,
         n_known: int = 0,
-    ) -> list[NDArray[np.float64]]:
+    ) -> list[Float]:
         """The best shape matches after those that are known already, pulled onto the mask's boundary."""
         options = self._options
         matches = match_shape(
@@ -232,7 +232,7 @@ class TemplateHypotheses:
         further = ShapeMatches(matches.T_cam_target[n_known:], matches.view[n_known:], matches.score[n_known:])
         return self._pulled(compared.bank, further, frame, field)
 
-    def _coarse_lit(self, frame: Frame, scorer: Scorer) -> list[NDArray[np.float64]]:
+    def _coarse_lit(self, frame: Frame, scorer: Scorer) -> list[Float]:
         """The best matches of brightness."""
         light, options = scorer.light(), self._options
         if light is None:
@@ -242,9 +242,7 @@ class TemplateHypotheses:
         )
         return list(matches.T_cam_target)
 
-    def _pulled(
-        self, bank: ViewBank, matches: ShapeMatches, frame: Frame, field: MaskField
-    ) -> list[NDArray[np.float64]]:
+    def _pulled(self, bank: ViewBank, matches: ShapeMatches, frame: Frame, field: MaskField) -> list[Float]:
         """Matches pulled onto the mask's boundary with the contour of their views: those that lie on it best."""
         scales = np.maximum(np.array(_COARSE_SCALES) * field.size_px, _MIN_SCALE_PX)
         lines = np.zeros((bank.contour_m.shape[1], 5))
@@ -259,9 +257,7 @@ class TemplateHypotheses:
         n_kept = max(1, int(np.ceil(_REFINED_SHARE * len(pulled))))
         return [pulled[i] for i in np.argsort(distance_px, kind="stable")[:n_kept]]
 
-    def _align(
-        self, starts: list[NDArray[np.float64]], frame: Frame, scorer: Scorer, in_sunlight: bool = False
-    ) -> list[Aligned]:
+    def _align(self, starts: list[Float], frame: Frame, scorer: Scorer, in_sunlight: bool = False) -> list[Aligned]:
         """Refine on the mask with rendered contours, or with what of them is sunlit, and compare shapes."""
         out = []
         for T in starts:
@@ -285,20 +281,20 @@ class TemplateHypotheses:
         R = np.stack([a.T_cam_target[:3, :3] for a in ordered])
         return [ordered[i] for i in distinct(R, n_best, np.radians(self._options.separation_deg))]
 
-    def _counterparts(self, scored: list[tuple[NDArray[np.float64], float]]) -> list[NDArray[np.float64]]:
+    def _counterparts(self, scored: list[tuple[Float, float]]) -> list[Float]:
         """Poses that look like the best candidate and have not been tried: nobody else may have been near them."""
         known = np.stack([T[:3, :3] for T, _ in scored])
         _, *others = self._alike(scored)
         return [T for T in others if lie.angle_between(known, T[:3, :3]).min() > np.radians(_TRIED_DEG)]
 
-    def _alike(self, scored: list[tuple[NDArray[np.float64], float]]) -> list[NDArray[np.float64]]:
+    def _alike(self, scored: list[tuple[Float, float]]) -> list[Float]:
         """The best candidate, and the poses that have nearly its silhouette: (4, 4) each."""
         leader, _ = max(scored, key=lambda pair: pair[1])
         return [leader, *(turned(leader, turn, self._target.center_m) for turn in self._near_symmetries)]
 
     def _closer_look(
-        self, scored: list[tuple[NDArray[np.float64], float]], frame: Frame, scorer: Scorer
-    ) -> list[tuple[NDArray[np.float64], float]]:
+        self, scored: list[tuple[Float, float]], frame: Frame, scorer: Scorer
+    ) -> list[tuple[Float, float]]:
         """The same, the best candidate and those that look like it compared once more by their details."""
         basin = np.stack([T[:3, :3] for T in self._alike(scored)])
         rest, best = [], {}
@@ -314,14 +310,14 @@ class TemplateHypotheses:
         again = self._finish(starts, frame, finer, self._finer_fitter)
         return rest + again if len(again) == len(starts) else scored
 
-    def _confirms(self, T_cam_target: NDArray[np.float64], prior: PosePrior | None) -> bool:
+    def _confirms(self, T_cam_target: Float, prior: PosePrior | None) -> bool:
         """Whether a candidate that leads is the healthy prior's: then nothing else is looked for."""
         if prior is None or not prior.healthy:
             return False
         apart_rad = lie.angle_between(T_cam_target[:3, :3], prior.T_cam_target[:3, :3])
         return bool(apart_rad < np.radians(self._options.separation_deg))
 
-    def _is_clear(self, scored: list[tuple[NDArray[np.float64], float]], prior: PosePrior | None) -> bool:
+    def _is_clear(self, scored: list[tuple[Float, float]], prior: PosePrior | None) -> bool:
         """Whether a candidate leads all other basins by far, or leads where the track expects it."""
         if not scored:
             return False
@@ -332,7 +328,7 @@ class TemplateHypotheses:
 
     def _finish(
         self, starts: list[Aligned], frame: Frame, scorer: Scorer, fitter: PoseFitter | None = None
-    ) -> list[tuple[NDArray[np.float64], float]]:
+    ) -> list[tuple[Float, float]]:
         """Refine on mask and image, and score: poses and log-likelihoods.
 
         Sunlight is fitted to those that it could still make the best; the others are given the worst of these fits.
@@ -359,9 +355,7 @@ class TemplateHypotheses:
         return [(T, score + float(extra)) for T, score, extra in zip(poses, scores, light, strict=True)]
 
 
-def _outline_distance_px(
-    T_cam_target: NDArray[np.float64], points_m: NDArray[np.float64], camera: Camera, field: MaskField
-) -> float:
+def _outline_distance_px(T_cam_target: Float, points_m: Float, camera: Camera, field: MaskField) -> float:
     """Mean distance of contour points (N, 3) from a mask's outline, pixels; far ones count as not quite so far."""
     uv = camera.project(points_m @ T_cam_target[:3, :3].T + T_cam_target[:3, 3]) - field.origin_px
     distance = cv2.remap(

@@ -19,10 +19,10 @@ from typing import Any
 import cv2
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from hat_ros.array_types import Float, UInt8
 from hat_ros.errors import BagError, FrameError, HatError, RunError
 from hat_ros.geometry import lie
 from hat_ros.io import messages, topics
@@ -225,7 +225,7 @@ class BagReader:
         for data, _ in self._raw(topic):
             yield stamp_of_cdr(data, self.path), data
 
-    def truth(self) -> dict[int, NDArray[np.float64]]:
+    def truth(self) -> dict[int, Float]:
         """True ``T_cam_target`` (4, 4) by exact stamp; empty when the bag has none.
 
         Raises:
@@ -233,9 +233,9 @@ class BagReader:
         """
         return {stamp: lie.matrix_from_row(row) for stamp, row in self.truth_rows().items()}
 
-    def truth_rows(self) -> dict[int, NDArray[np.float64]]:
+    def truth_rows(self) -> dict[int, Float]:
         """True pose rows (7,) by exact stamp, as recorded."""
-        out: dict[int, NDArray[np.float64]] = {}
+        out: dict[int, Float] = {}
         for message in self.messages(self.truth_topic) if self.truth_topic else ():
             row = messages.pose_row_from(message.pose)
             if not np.isfinite(row).all() or abs(np.linalg.norm(row[3:]) - 1) > 1e-3:
@@ -365,11 +365,11 @@ class BagWriter:
     def write_frame(
         self,
         stamp_ns: int,
-        image: NDArray[np.uint8] | bytes,
+        image: UInt8 | bytes,
         camera: Camera,
         *,
-        mask: NDArray[np.uint8] | None = None,
-        T_cam_target: NDArray[np.float64] | None = None,
+        mask: UInt8 | None = None,
+        T_cam_target: Float | None = None,
     ) -> None:
         """Append one frame: image and camera_info, and what is known of mask and truth, all with the same stamp.
 
@@ -394,7 +394,7 @@ class BagWriter:
         kind = "png" if data[:4] == b"\x89PNG" else "jpeg"
         self.write_message(topics.IMAGE_COMPRESSED, make.compressed(stamp_ns, frame_id, kind, data), stamp_ns)
 
-    def _encoded(self, rgb: NDArray[np.uint8]) -> bytes:
+    def _encoded(self, rgb: UInt8) -> bytes:
         bgr = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2BGR)
         if self._format == "png":
             return cv2.imencode(".png", bgr)[1].tobytes()

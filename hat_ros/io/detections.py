@@ -22,8 +22,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import UInt8
 from hat_ros.errors import DatasetError
 from hat_ros.segmentation.annotated import BOX, SILHOUETTE
 from hat_ros.types import MAX_IMAGE_SIDE_PX
@@ -31,7 +31,7 @@ from hat_ros.types import MAX_IMAGE_SIDE_PX
 MAX_FILE_BYTES = 1 << 30
 MASK_SUFFIXES = (".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg")
 
-Mask = NDArray[np.uint8]
+Mask = UInt8
 
 
 class DetectionLookup:

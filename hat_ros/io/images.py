@@ -11,12 +11,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import UInt8
 from hat_ros.errors import FrameError
 from hat_ros.types import MAX_IMAGE_SIDE_PX, Detection
-
-UInt8 = NDArray[np.uint8]
 
 SILHOUETTE = 255
 BOX = 128

@@ -17,22 +17,11 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Float, UInt8
 from hat_ros.errors import FrameError, HatError, WireError
 from hat_ros.io import images, topics
-from hat_ros.types import (
-    Alignment,
-    Camera,
-    Candidates,
-    Detection,
-    Estimate,
-    Motion,
-    Selection,
-    TrackState,
-)
-
-Float = NDArray[np.float64]
+from hat_ros.types import Alignment, Camera, Candidates, Detection, Estimate, Motion, Selection, TrackState
 
 _FLOAT64 = 8
 _NS_PER_S = 1_000_000_000
@@ -209,7 +198,7 @@ class Wire:
             roi=roi,
         )
 
-    def image(self, stamp_ns: int, frame_id: str, encoding: str, pixels: NDArray[np.uint8]) -> Any:
+    def image(self, stamp_ns: int, frame_id: str, encoding: str, pixels: UInt8) -> Any:
         """Image of (H, W) or (H, W, C) uint8 pixels."""
         pixels = np.ascontiguousarray(pixels)
         return self._class("sensor_msgs/msg/Image")(
@@ -228,7 +217,7 @@ class Wire:
             header=self.header(stamp_ns, frame_id), format=image_format, data=self._octets(data)
         )
 
-    def frame(self, stamp_ns: int, frame_id: str, rgb: NDArray[np.uint8], detection: Detection | None) -> Any:
+    def frame(self, stamp_ns: int, frame_id: str, rgb: UInt8, detection: Detection | None) -> Any:
         """Image of ``/hat/frame``: rgba8, alpha = mask, see :func:`hat_ros.io.images.rgba_from`."""
         return self.image(stamp_ns, frame_id, "rgba8", images.rgba_from(rgb, detection))
 
@@ -503,7 +492,7 @@ def same_camera(a: Camera | None, b: Camera | None) -> bool:
     return np.array_equal(a.K, b.K) and (a.width, a.height) == (b.width, b.height)
 
 
-def frame_from(message: Any) -> tuple[NDArray[np.uint8], Detection | None]:
+def frame_from(message: Any) -> tuple[UInt8, Detection | None]:
     """Decode ``/hat/frame``: (H, W, 3) uint8 and the detection.
 
     Raises:

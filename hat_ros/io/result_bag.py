@@ -12,17 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rosbags.rosbag2 import Reader
 
+from hat_ros.array_types import Float
 from hat_ros.errors import BagError, HatError
 from hat_ros.io import messages, topics
 from hat_ros.io.bag import TYPESTORE, BagWriter, check_manifest, deserialize
 from hat_ros.io.run_log import RunLog, RunLogBuilder
 from hat_ros.tracker import Step
 from hat_ros.types import Alignment, Camera, Candidates, Estimate, Motion
-
-Float = NDArray[np.float64]
 
 
 class ResultBagWriter:

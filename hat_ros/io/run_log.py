@@ -8,14 +8,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float, Int
 from hat_ros.geometry import lie
 from hat_ros.types import Candidates, Estimate, Motion, TrackState
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

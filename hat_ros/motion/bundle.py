@@ -20,8 +20,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float
 from hat_ros.geometry.linear import (
     cholesky_in_place,
     cholesky_solve,
@@ -33,9 +33,6 @@ from hat_ros.geometry.linear import (
     turn_between,
 )
 from hat_ros.motion.reprojection import MIN_DEPTH, loss, observe, weight
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 # Squared scales, in sigmas, of the losses on expected points and rotations; rotations all share their gauge, so that a
 # drift across the window may set the outer ones far apart.

@@ -10,8 +10,8 @@ from collections.abc import Iterator, Sequence
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Float, UInt8
 from hat_ros.config import DroidConfig, HatConfig
 from hat_ros.errors import ConfigError
 from hat_ros.geometry import lie
@@ -90,9 +90,7 @@ class DroidSlam:
         """Keyframes held."""
         return len(self._frontend.keyframes) if self._frontend else 0
 
-    def _new_frontend(
-        self, image: NDArray[np.uint8], intrinsics: NDArray[np.float64], keep_all: bool = False
-    ) -> DroidFrontend:
+    def _new_frontend(self, image: UInt8, intrinsics: Float, keep_all: bool = False) -> DroidFrontend:
         shape = image.shape[2] // STRIDE_PX, image.shape[3] // STRIDE_PX
         rows = torch.tensor(intrinsics / STRIDE_PX, dtype=torch.float32, device=self._device)
         stored = keep_volumes(self._config, shape, self._model.dtype)
@@ -138,7 +136,7 @@ def offline_motions(
     return [Motion(True, 0, next(rows), n) if use else Motion.none(0, n) for use in used]
 
 
-def prepare(frame: Frame, config: DroidConfig) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+def prepare(frame: Frame, config: DroidConfig) -> tuple[UInt8, Float]:
     """Resize to the input area, crop right and bottom to multiples of 8, and put channels in DROID's order.
 
     Returns:
@@ -175,6 +173,6 @@ def _same_camera(a: Camera, b: Camera) -> bool:
     return (a.width, a.height) == (b.width, b.height) and np.array_equal(a.K, b.K)
 
 
-def slam_rows(camera_from_world: NDArray[np.float64]) -> NDArray[np.float64]:
+def slam_rows(camera_from_world: Float) -> Float:
     """Rows of ``T_slam_cam`` from DROID's ``T_cam_world``: (..., 7) -> (..., 7)."""
     return lie.row_from_matrix(lie.inverse(lie.matrix_from_row(camera_from_world)))

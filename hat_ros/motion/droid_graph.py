@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from hat_ros.array_types import Bool, Float32, Int
 from hat_ros.motion.droid_keyframes import FlowModel, Keyframes, PairCorrelation
 from hat_ros.nets.droid_ba import (
     LOCAL_DAMPING,
@@ -26,8 +26,8 @@ from hat_ros.nets.droid_ba import (
 )
 from hat_ros.nets.droid_geometry import frame_distance, pixel_grid, reproject
 
-Index = NDArray[np.int64]
-Pairs = NDArray[np.int64]
+Index = Int
+Pairs = Int
 
 MAX_FACTORS = 48
 # Frames further apart than this (units of 8 pixels) are never compared.
@@ -62,7 +62,7 @@ def neighbour_pairs(first: int, end: int, radius: int) -> Pairs:
 
 
 def proximity_pairs(
-    distance: NDArray[np.float32],
+    distance: Float32,
     first_i: int,
     first_j: int,
     existing: Pairs,
@@ -189,13 +189,13 @@ class FactorGraph:
         )
         self.add(proximity_pairs(distance, first_i, first_j, existing, rule, self.max_factors), make_room)
 
-    def distance(self, i: Index, j: Index, beta: float) -> NDArray[np.float32]:
+    def distance(self, i: Index, j: Index, beta: float) -> Float32:
         """Frame distance of pairs on the host: (n,), (n,) -> (n,). Waits for the device."""
         frames = self.keyframes
         d = frame_distance(frames.poses, frames.disparities, frames.intrinsics, self._send(i), self._send(j), beta)
         return d.cpu().numpy()
 
-    def drop(self, mask: NDArray[np.bool_], retire: bool) -> None:
+    def drop(self, mask: Bool, retire: bool) -> None:
         """Take active edges out; retired ones keep their last coordinates for bundle adjustment."""
         if not mask.any():
             return
@@ -308,7 +308,7 @@ class FactorGraph:
         )
         return self._plan
 
-    def _drop_inactive(self, mask: NDArray[np.bool_]) -> None:
+    def _drop_inactive(self, mask: Bool) -> None:
         self._plan = None
         kept = self._send(np.flatnonzero(~mask))
         self.ii_inactive, self.jj_inactive = self.ii_inactive[~mask], self.jj_inactive[~mask]

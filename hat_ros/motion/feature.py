@@ -9,8 +9,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Float, UInt8
 from hat_ros.config import HatConfig
 from hat_ros.geometry import lie
 from hat_ros.motion.surface import SurfacePrior
@@ -19,9 +19,6 @@ from hat_ros.motion.window import Window, rehearse
 from hat_ros.target.embree import RayCaster
 from hat_ros.target.model import Target
 from hat_ros.types import Camera, Detection, Frame, Motion, PosePrior
-
-Float = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 # Points needed to start, and points that must agree with a new pose.
 _MIN_POINTS = 8
@@ -105,7 +102,7 @@ class FeatureSlam:
         self._n_lost = 0
         self._met_prior = False
 
-    def _start(self, stamp_ns: int, image: Image, region: Image) -> Motion:
+    def _start(self, stamp_ns: int, image: UInt8, region: UInt8) -> Motion:
         """First frame of an epoch: defines the gauge, if it shows enough points."""
         slots = self._tracks.replenish(image, region)
         if len(slots) < _MIN_POINTS:
@@ -128,7 +125,7 @@ class FeatureSlam:
             self._surface.remember(self._window, self._tracks.track_id)
         return self._motion()
 
-    def _advance(self, stamp_ns: int, image: Image, region: Image, prior: PosePrior | None) -> bool:
+    def _advance(self, stamp_ns: int, image: UInt8, region: UInt8, prior: PosePrior | None) -> bool:
         """One frame more; False when the points do not say where it was taken."""
         window, tracks = self._window, self._tracks
         tracks.advance(image, region, self._guess(stamp_ns))
@@ -185,7 +182,7 @@ class FeatureSlam:
         before, after = np.where(front[:, None], before, 1.0), np.where(front[:, None], after, 1.0)
         return self._tracks.xy + self._camera.project(after) - self._camera.project(before)
 
-    def _replenish(self, image: Image, region: Image) -> None:
+    def _replenish(self, image: UInt8, region: UInt8) -> None:
         window, tracks = self._window, self._tracks
         known = np.flatnonzero(tracks.alive)
         slots = tracks.replenish(image, region)
@@ -230,7 +227,7 @@ def depth_beside(xy: Float, xy_known: Float, z_known: Float) -> tuple[Float, flo
     return out, 1.48 * float(np.median(np.abs(z_known - np.median(z_known))))
 
 
-def bulge(region: Image, xy: Float) -> Float:
+def bulge(region: UInt8, xy: Float) -> Float:
     """Height (n,) in [0, 1] of a cushion over the region at (n, 2) pixels: half a circle over the distance inwards."""
     inwards = cv2.distanceTransform(region, cv2.DIST_L2, 5)
     col, row = np.rint(xy).astype(int).T

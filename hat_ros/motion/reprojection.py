@@ -8,12 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float
 from hat_ros.geometry.linear import cholesky_in_place, cholesky_solve, product, rotation, turn_between
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 # Nearer than this share of the unit (the target's distance at the start) a point counts as behind the camera.
 MIN_DEPTH = 1e-3

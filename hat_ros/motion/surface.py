@@ -11,16 +11,14 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Float, Int
 from hat_ros.config import FeatureSlamConfig
 from hat_ros.geometry import lie
 from hat_ros.geometry.linear import robust_mean_rotation
 from hat_ros.motion.window import Window
 from hat_ros.target.embree import RayCaster
 from hat_ros.types import PosePrior
-
-Float = NDArray[np.float64]
 
 # Depth is sampled here, px: the spread over the cross is what a misplaced silhouette or edge could cost.
 _CROSS_PX = np.array([[0.0, 0.0], [3.0, 0.0], [-3.0, 0.0], [0.0, 3.0], [0.0, -3.0]])
@@ -41,7 +39,7 @@ _MIN_ROTATIONS = 3
 class _Past:
     stamp_ns: int
     xn: Float
-    track_id: NDArray[np.int64]
+    track_id: Int
     R: Float
     t: Float
 
@@ -66,14 +64,14 @@ class SurfacePrior:
         self._rotation: dict[int, Float] = {}
         self._units_per_m: float | None = None
 
-    def remember(self, window: Window, track_id: NDArray[np.int64]) -> None:
+    def remember(self, window: Window, track_id: Int) -> None:
         """Keep the newest frame's observations until its fused pose arrives."""
         seen = window.seen[-1]
         self._past.append(
             _Past(window.stamps_ns[-1], window.xn[-1].copy(), np.where(seen, track_id, -1), window.R[-1], window.t[-1])
         )
 
-    def expect(self, window: Window, track_id: NDArray[np.int64], prior: PosePrior) -> bool:
+    def expect(self, window: Window, track_id: Int, prior: PosePrior) -> bool:
         """Let the prior move the window's expectations; returns whether it did."""
         past = next((past for past in self._past if past.stamp_ns == prior.stamp_ns), None)
         if past is None or prior.stamp_ns in self._rotation:
@@ -103,7 +101,7 @@ class SurfacePrior:
         known = hit[:, 0] & (np.count_nonzero(hit, axis=1) >= _MIN_HITS)
         return np.where(known, z[:, 0], np.nan), self._sigma_m + 0.5 * np.where(known, spread, 0.0)
 
-    def _expect_points(self, window: Window, past: _Past, slots: NDArray[np.int64], z_m: Float, sigma_m: Float) -> None:
+    def _expect_points(self, window: Window, past: _Past, slots: Int, z_m: Float, sigma_m: Float) -> None:
         R, t = past.R, past.t
         if past.stamp_ns in window.stamps_ns:  # adjusted since
             k = window.stamps_ns.index(past.stamp_ns)

@@ -9,11 +9,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
-Image = NDArray[np.uint8]
+from hat_ros.array_types import Bool, Float, Int, UInt8
 
 _WINDOW_PX = 17
 _LEVELS = 3
@@ -57,9 +54,9 @@ class PointTracks:
         self._next_id = 0
         self._n_followed = 0  # after the last look for corners
         self._since_look = 0
-        self._image: Image | None = None
+        self._image: UInt8 | None = None
 
-    def advance(self, image: Image, region: Image, xy_guess: Float) -> None:
+    def advance(self, image: UInt8, region: UInt8, xy_guess: Float) -> None:
         """Follow all points into the next image; those that are lost or leave the region free their slots.
 
         Args:
@@ -76,7 +73,7 @@ class PointTracks:
         self.alive[slots[~found]] = False
         self._image = image
 
-    def replenish(self, image: Image, region: Image) -> NDArray[np.int64]:
+    def replenish(self, image: UInt8, region: UInt8) -> Int:
         """Fill free slots with new corners; returns the slots filled."""
         self._image = image
         free = np.flatnonzero(~self.alive)
@@ -97,7 +94,7 @@ class PointTracks:
         return slots
 
 
-def follow(previous: Image, current: Image, xy: Float, xy_guess: Float) -> tuple[Float, Bool]:
+def follow(previous: UInt8, current: UInt8, xy: Float, xy_guess: Float) -> tuple[Float, Bool]:
     """Positions of points in the next image.
 
     Args:
@@ -129,7 +126,7 @@ def follow(previous: Image, current: Image, xy: Float, xy_guess: Float) -> tuple
     return moved.astype(np.float64) + origin, found
 
 
-def detect(image: Image, region: Image, taken: Float, count: int, spacing_px: float) -> Float:
+def detect(image: UInt8, region: UInt8, taken: Float, count: int, spacing_px: float) -> Float:
     """Strongest corners of a region, clear of points already taken.
 
     Args:
@@ -157,7 +154,7 @@ def detect(image: Image, region: Image, taken: Float, count: int, spacing_px: fl
 
 
 @njit(cache=True)
-def clear_disks(mask: Image, centers: NDArray[np.int64], disk: Image) -> None:
+def clear_disks(mask: UInt8, centers: Int, disk: UInt8) -> None:
     """Set a mask (H, W) to zero where disk (2 r + 1, 2 r + 1) is not, laid on each of the centers (M, 2) x, y.
 
     Keeps the interpreter lock: one call per point of OpenCV would hand it over as often.

@@ -8,16 +8,13 @@ say nothing about depth where sixty frames do (bas-relief ambiguity).
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float, Int
 from hat_ros.config import FeatureSlamConfig
 from hat_ros.geometry import lie
 from hat_ros.geometry.linear import robust_mean_rotation, turn_between
 from hat_ros.motion.bundle import Problem, adjust_window, window_cost
 from hat_ros.motion.reprojection import refine_pose
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 # Newest frames that are never thinned out.
 _RECENT_FRAMES = 5
@@ -155,7 +152,7 @@ class Window:
         self.fused_info = np.append(self.fused_info, 0.0)
         self.R_emitted = np.concatenate([self.R_emitted, R[None]])
 
-    def place(self, slots: NDArray[np.int64], xn: Float, z: Float, sigma: float) -> None:
+    def place(self, slots: Int, xn: Float, z: Float, sigma: float) -> None:
         """New points in slots, seen by the newest frame at (n, 2) with expected depth (n,) +- sigma."""
         in_camera = np.concatenate([xn, np.ones((len(xn), 1))], axis=1) * z[:, None]
         self.X[slots] = self.X_guess[slots] = (in_camera - self.t[-1]) @ self.R[-1]

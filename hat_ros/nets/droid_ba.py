@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from hat_ros.array_types import Int
 from hat_ros.nets.droid_geometry import (
     pixel_rays,
     relative_poses,
@@ -23,7 +23,7 @@ from hat_ros.nets.droid_geometry import (
     transform_points,
 )
 
-Index = NDArray[np.int64]
+Index = Int
 
 _WEIGHT_SCALE = 1e-3
 _SENSOR_WEIGHT = 0.05

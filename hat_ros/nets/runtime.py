@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from hat_ros.array_types import UInt8
 from hat_ros.config import NetsConfig
 from hat_ros.errors import ConfigError
 
@@ -70,7 +71,7 @@ class Runtime:
         values = np.ascontiguousarray(array, dtype=np.float32)
         return torch.from_numpy(values if values.flags.writeable else values.copy()).to(self.device)
 
-    def image(self, rgb: NDArray[np.uint8]) -> torch.Tensor:
+    def image(self, rgb: UInt8) -> torch.Tensor:
         """(H, W, 3) uint8 -> (3, H, W) float32 in [0, 1] on the device; moved as bytes."""
         moved = torch.from_numpy(np.ascontiguousarray(rgb)).to(self.device)
         return moved.permute(2, 0, 1).float() / 255

@@ -8,10 +8,11 @@ the grid that MegaPose's coarse network was trained with.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from hat_ros.array_types import Float
 
 
-def so3_grid(level: int = 2) -> NDArray[np.float64]:
+def so3_grid(level: int = 2) -> Float:
     """Unit quaternions xyzw of the grid: (72 * 8**(level - 1), 4); level 1 has 72 rotations, level 2 has 576.
 
     Raises:
@@ -34,7 +35,7 @@ def so3_grid(level: int = 2) -> NDArray[np.float64]:
     )
 
 
-def _healpix_directions(n_side: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _healpix_directions(n_side: int) -> tuple[Float, Float]:
     """Polar angle and azimuth of the 12 n_side^2 pixel centres, ring by ring from the north."""
     z, phi = [], []
     for ring in range(1, 4 * n_side):

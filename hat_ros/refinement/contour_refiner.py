@@ -7,8 +7,8 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Float
 from hat_ros.config import RefinementConfig
 from hat_ros.geometry import lie
 from hat_ros.refinement.covariance import outline_floor, outline_misfit_px, pose_covariance
@@ -74,7 +74,7 @@ class _Task:
 
     image: _Image
     prior: RotationPrior
-    start: NDArray[np.float64]
+    start: Float
     view: View | None
 
 
@@ -99,7 +99,7 @@ class ContourRefiner:
         self,
         frame: Frame,
         detection: Detection | None,
-        T_cam_target: NDArray[np.float64],
+        T_cam_target: Float,
         prior: RotationPrior | None = None,
     ) -> Refined | None:
         """Refine a pose within its basin.
@@ -142,7 +142,7 @@ class ContourRefiner:
             self._image = _Image(frame, detection)
         return self._image
 
-    def _task(self, image: _Image, T_cam_target: NDArray[np.float64], prior: RotationPrior | None) -> _Task:
+    def _task(self, image: _Image, T_cam_target: Float, prior: RotationPrior | None) -> _Task:
         """The start is centred on the mask if need be."""
         camera = image.frame.camera
         prior = prior or RotationPrior(T_cam_target[:3, :3], self._start_information)
@@ -196,7 +196,7 @@ class ContourRefiner:
         # The view is the start's.
         return fit if np.hypot(*fit.shift_px) + fit.twist_px <= _SMALL_MOVE_PX else None
 
-    def _fit_all(self, task: _Task, view: View | None, to_sun_cam: NDArray[np.float64] | None = None) -> Fit | None:
+    def _fit_all(self, task: _Task, view: View | None, to_sun_cam: Float | None = None) -> Fit | None:
         """All rounds, from the widest to the finest, with a view of the start, all or its sunlit part."""
         frame, field, rounds = task.image.frame, task.image.field, WITHOUT_MASK
         if field is not None:
@@ -204,7 +204,7 @@ class ContourRefiner:
             rounds = (WITH_MASK[0].scaled(factor), *WITH_MASK[1:])
         return self._fitter.fit(task.start, frame.camera, frame.rgb, field, rounds, task.prior, to_sun_cam, view)
 
-    def _same_basin(self, T_before: NDArray[np.float64], T_after: NDArray[np.float64]) -> bool:
+    def _same_basin(self, T_before: Float, T_after: Float) -> bool:
         turn = np.degrees(lie.angle_between(T_before[:3, :3], T_after[:3, :3]))
         center_before = T_before[:3, :3] @ self._target.center_m + T_before[:3, 3]
         center_after = T_after[:3, :3] @ self._target.center_m + T_after[:3, 3]

@@ -7,8 +7,8 @@ as one sample, and holds the errors common to the whole outline as two more unkn
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Float
 from hat_ros.refinement.mask_field import Overlap
 from hat_ros.refinement.pose_fitter import Fit
 
@@ -30,7 +30,7 @@ def outline_misfit_px(areas: Overlap, outline_px: float) -> float:
     return max((areas.extra + areas.missing) / max(outline_px, 1.0) - USUAL_MISFIT_PX, 0.0)
 
 
-def outline_floor(T_cam_target: NDArray[np.float64], focal_px: float, radius_m: float) -> NDArray[np.float64]:
+def outline_floor(T_cam_target: Float, focal_px: float, radius_m: float) -> Float:
     """(6, 6) what exposure, blur and the CAD model do to an outline, which no residual of one image shows.
 
     An outline that is some pixels too wide all around is a depth error of that share of the target's apparent radius;
@@ -50,7 +50,7 @@ def outline_floor(T_cam_target: NDArray[np.float64], focal_px: float, radius_m: 
     return floor
 
 
-def pose_covariance(fit: Fit, radius_m: float) -> NDArray[np.float64] | None:
+def pose_covariance(fit: Fit, radius_m: float) -> Float | None:
     """(6, 6) covariance of ``[dt (m); r (rad)]``; None when nothing was measured.
 
     Args:
@@ -67,5 +67,5 @@ def pose_covariance(fit: Fit, radius_m: float) -> NDArray[np.float64] | None:
     return covariance / np.outer(scale[:6], scale[:6])
 
 
-def _symmetric(lower: NDArray[np.float64]) -> NDArray[np.float64]:
+def _symmetric(lower: Float) -> Float:
     return np.tril(lower) + np.tril(lower, -1).T

@@ -6,12 +6,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Float32 = NDArray[np.float32]
+from hat_ros.array_types import Float, Float32, Int32
 
 
 @njit(cache=True, nogil=True)
 def hit_points(
-    origins_m: Float32, directions: Float32, face: NDArray[np.int32], distance: Float32
+    origins_m: Float32, directions: Float32, face: Int32, distance: Float32
 ) -> tuple[NDArray[np.intp], Float32]:
     """Which of N rays hit something (M,), and where (M, 3).
 
@@ -32,7 +32,7 @@ def hit_points(
 
 
 @njit(cache=True, nogil=True)
-def normals_towards(directions: Float32, face: NDArray[np.int32], face_normals: Float32) -> Float32:
+def normals_towards(directions: Float32, face: Int32, face_normals: Float32) -> Float32:
     """Normals (N, 3) of faces (N,) on the side that rays (N, 3) came from, however the file winds them."""
     out = np.empty((len(face), 3), np.float32)
     for i in range(len(face)):
@@ -74,9 +74,7 @@ def facing(
 
 
 @njit(cache=True, nogil=True)
-def image_box(
-    points_m: NDArray[np.float64], R: NDArray[np.float64], t: NDArray[np.float64], K: NDArray[np.float64], near_m: float
-) -> NDArray[np.float64] | None:
+def image_box(points_m: Float, R: Float, t: Float, K: Float, near_m: float) -> Float | None:
     """Box (x0, y0, x1, y1) in pixels of points (N, 3) at a pose (3, 3), (3,); None unless all lie beyond ``near_m``."""
     box = np.array([np.inf, np.inf, -np.inf, -np.inf])
     for i in range(len(points_m)):

@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float, Float32, UInt8
 from hat_ros.refinement.view import View
 
 # Luma at which background is bright enough to tell that no target covers it; a shadowed part is black.
@@ -29,7 +30,7 @@ class MaskField:
         mask: (H, W) bool with at least one pixel set.
     """
 
-    def __init__(self, mask: NDArray[np.bool_]) -> None:
+    def __init__(self, mask: Bool) -> None:
         self.mask = mask
         pixels = mask.view(np.uint8)
         left, top, width, height = cv2.boundingRect(pixels)
@@ -55,7 +56,7 @@ class MaskField:
         self.distance = cv2.GaussianBlur(distance, (0, 0), 1.0)
 
     @cached_property
-    def centroid_px(self) -> NDArray[np.float64]:
+    def centroid_px(self) -> Float:
         """(2,) centre of gravity."""
         pixels = self.mask.view(np.uint8)
         left, top, width, height = cv2.boundingRect(pixels)
@@ -72,7 +73,7 @@ class MaskField:
         bins = np.minimum(depth * (1 / _DEPTH_BIN_PX), _DEPTH_BINS - 1).astype(np.intp)
         return np.bincount(bins, minlength=_DEPTH_BINS)
 
-    def compare(self, view: View, luma: NDArray[np.uint8], tolerance_px: float | None = None) -> Overlap:
+    def compare(self, view: View, luma: UInt8, tolerance_px: float | None = None) -> Overlap:
         """Areas of agreement and disagreement with a rendered silhouette.
 
         Args:
@@ -97,11 +98,11 @@ class MaskField:
 
 @njit(cache=True, nogil=True)
 def silhouette_areas(
-    silhouette: NDArray[np.bool_],
-    distance: NDArray[np.float32],
-    offset: NDArray[np.float64],
-    luma: NDArray[np.uint8],
-    origin: NDArray[np.float64],
+    silhouette: Bool,
+    distance: Float32,
+    offset: Float,
+    luma: UInt8,
+    origin: Float,
     step: float,
     depth: float,
     band: float,

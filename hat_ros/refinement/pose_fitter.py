@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Float, UInt8
 from hat_ros.geometry import lie
 from hat_ros.refinement.mask_field import MaskField
 from hat_ros.refinement.solver import fit_contour
@@ -73,13 +73,13 @@ class Fit:
         twist_px: how far its parts lie from there besides, at most.
     """
 
-    T_cam_target: NDArray[np.float64]
-    information: NDArray[np.float64]
-    contour: NDArray[np.float64]
-    lines: NDArray[np.float64]
+    T_cam_target: Float
+    information: Float
+    contour: Float
+    lines: Float
     mask_bias_px: float
     view: View
-    shift_px: NDArray[np.float64]
+    shift_px: Float
     twist_px: float
 
     @property
@@ -117,13 +117,13 @@ class PoseFitter:
 
     def fit(
         self,
-        T_cam_target: NDArray[np.float64],
+        T_cam_target: Float,
         camera: Camera,
-        image: NDArray[np.uint8],
+        image: UInt8,
         field: MaskField | None,
         rounds: tuple[Schedule, ...],
         prior: RotationPrior | None = None,
-        to_sun_cam: NDArray[np.float64] | None = None,
+        to_sun_cam: Float | None = None,
         view: View | None = None,
     ) -> Fit | None:
         """Refine a pose, held to what is known of its rotation; None when the target leaves the view on the way.
@@ -144,13 +144,13 @@ class PoseFitter:
 
     def pull(
         self,
-        T_cam_target: NDArray[np.float64],
-        points_m: NDArray[np.float64],
-        lines: NDArray[np.float64],
+        T_cam_target: Float,
+        points_m: Float,
+        lines: Float,
         frame: Frame,
         field: MaskField,
-        scales_px: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
+        scales_px: Float,
+    ) -> Float:
         """Pull given contour points onto the mask's boundary, without rendering: the (4, 4) pose."""
         off = np.zeros(len(scales_px))
         R, t, *_ = fit_contour(
@@ -174,12 +174,12 @@ class PoseFitter:
 
     def centred(
         self,
-        T_cam_target: NDArray[np.float64],
+        T_cam_target: Float,
         camera: Camera,
         field: MaskField,
-        luma: NDArray[np.uint8],
+        luma: UInt8,
         view: View | None = None,
-    ) -> NDArray[np.float64]:
+    ) -> Float:
         """The start moved sideways so that silhouette and mask share their centroid, if that covers the mask.
 
         The view of the start, of any size, spares its rendering.
@@ -211,10 +211,10 @@ class PoseFitter:
 
     def iterate(
         self,
-        T_cam_target: NDArray[np.float64],
+        T_cam_target: Float,
         view: View,
         camera: Camera,
-        image: NDArray[np.uint8],
+        image: UInt8,
         field: MaskField | None,
         schedule: Schedule,
         prior: RotationPrior | None = None,
@@ -246,9 +246,7 @@ class PoseFitter:
         shift_px, twist_px = self._displacement_px(view.T_cam_target, T, camera)
         return Fit(T, H, contour, lines.lines, mask_bias, view, shift_px, twist_px)
 
-    def _displacement_px(
-        self, T_before: NDArray[np.float64], T_after: NDArray[np.float64], camera: Camera
-    ) -> tuple[NDArray[np.float64], float]:
+    def _displacement_px(self, T_before: Float, T_after: Float, camera: Camera) -> tuple[Float, float]:
         """How the target's middle moves in the image (2,), and how far a part of it moves against that at most."""
         target = self.viewer.target
         before, after = (T[:3, :3] @ target.center_m + T[:3, 3] for T in (T_before, T_after))

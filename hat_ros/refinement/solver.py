@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Float, Float32, UInt8
 from hat_ros.geometry.linear import cholesky_in_place, cholesky_solve, product, rotation
-
-Array = NDArray[np.float64]
 
 # Lines with less free target or background than this have no colour of their own to compare.
 MIN_REACH_PX = 2.0
@@ -47,7 +45,7 @@ def _normal_row(
     fy: float,
     nu: float,
     nv: float,
-    row: Array,
+    row: Float,
 ) -> None:
     """Derivative of the image position along (nu, nv) with respect to the pose update, into row (6,)."""
     gx = nu * fx / z
@@ -62,7 +60,7 @@ def _normal_row(
 
 @njit(cache=True, nogil=True)
 def _accumulate(
-    kind: int, H: Array, g: Array, squares: Array, weights: Array, row: Array, weight: float, residual: float
+    kind: int, H: Float, g: Float, squares: Float, weights: Float, row: Float, weight: float, residual: float
 ) -> None:
     """Add one weighted residual with derivative row to the normal equations of its kind (lower triangle)."""
     for i in range(len(row)):
@@ -74,7 +72,7 @@ def _accumulate(
 
 
 @njit(cache=True, nogil=True)
-def _damped_step(H: Array, g: Array, damping: float, radius_m: float) -> tuple[bool, Array]:
+def _damped_step(H: Float, g: Float, damping: float, radius_m: float) -> tuple[bool, Float]:
     """Step of the pose and the biases; damping is a share of the mean translational information."""
     level = (H[0, 0] + H[1, 1] + H[2, 2]) / 3.0 * damping + 1e-12
     L = H.copy()
@@ -87,7 +85,7 @@ def _damped_step(H: Array, g: Array, damping: float, radius_m: float) -> tuple[b
 
 
 @njit(cache=True, nogil=True)
-def _mask_distance(distance: NDArray[np.float32], a: float, b: float, out: Array) -> None:
+def _mask_distance(distance: Float32, a: float, b: float, out: Float) -> None:
     """Bilinear signed distance and its gradient at crop position (a, b), into out (3,)."""
     h, w = distance.shape
     a, b = min(max(a, 0.0), w - 1.001), min(max(b, 0.0), h - 1.001)
@@ -101,7 +99,7 @@ def _mask_distance(distance: NDArray[np.float32], a: float, b: float, out: Array
 
 
 @njit(cache=True, nogil=True)
-def _sample(image: NDArray[np.uint8], u: float, v: float, out: Array) -> None:
+def _sample(image: UInt8, u: float, v: float, out: Float) -> None:
     """Bilinear colour at (u, v), which must lie inside the image."""
     iu, iv = int(u), int(v)
     fu, fv = u - iu, v - iv
@@ -113,7 +111,7 @@ def _sample(image: NDArray[np.uint8], u: float, v: float, out: Array) -> None:
 
 @njit(cache=True, nogil=True)
 def edge_offset(
-    image: NDArray[np.uint8],
+    image: UInt8,
     u: float,
     v: float,
     nu: float,
@@ -121,8 +119,8 @@ def edge_offset(
     reach_in: float,
     reach_out: float,
     step: float,
-    profile: Array,
-    levels: Array,
+    profile: Float,
+    levels: Float,
 ) -> tuple[float, float]:
     """Where the image's own edge lies along an outward normal.
 
@@ -176,9 +174,9 @@ def edge_offset(
 
 @njit(cache=True, nogil=True)
 def _add_residuals(
-    points: Array, lines: Array, R: Array, t: Array, K: Array, image: NDArray[np.uint8], reach_px: float,
-    distance: NDArray[np.float32], origin: Array, scales_px: Array, biases: Array,
-    H: Array, g: Array, squares: Array, weights: Array, state: Array,
+    points: Float, lines: Float, R: Float, t: Float, K: Float, image: UInt8, reach_px: float,
+    distance: Float32, origin: Float, scales_px: Float, biases: Float,
+    H: Float, g: Float, squares: Float, weights: Float, state: Float,
 ) -> None:  # fmt: skip
     """Normal equations of mask and edges at a pose, one after the other.
 
@@ -226,8 +224,8 @@ def _add_residuals(
 
 @njit(cache=True, nogil=True)
 def _combine(
-    H_each: Array, g_each: Array, squares: Array, weights: Array, biases: Array, correlation_px: float,
-    H: Array, g: Array,
+    H_each: Float, g_each: Float, squares: Float, weights: Float, biases: Float, correlation_px: float,
+    H: Float, g: Float,
 ) -> None:  # fmt: skip
     """Both residuals by their measured variances, and what is known of the biases: into H (8, 8), lower triangle, g."""
     H[:], g[:] = 0.0, 0.0
@@ -244,22 +242,22 @@ def _combine(
 
 @njit(cache=True, nogil=True)
 def fit_contour(
-    points: Array,
-    lines: Array,
-    R: Array,
-    t: Array,
-    K: Array,
-    image: NDArray[np.uint8],
-    reaches_px: Array,
-    distance: NDArray[np.float32],
-    origin: Array,
-    mask_scales_px: Array,
-    edge_scales_px: Array,
-    dampings: Array,
-    turned: Array,
-    rotation_info: Array,
+    points: Float,
+    lines: Float,
+    R: Float,
+    t: Float,
+    K: Float,
+    image: UInt8,
+    reaches_px: Float,
+    distance: Float32,
+    origin: Float,
+    mask_scales_px: Float,
+    edge_scales_px: Float,
+    dampings: Float,
+    turned: Float,
+    rotation_info: Float,
     radius_m: float,
-) -> tuple[Array, Array, Array, Array, float, float]:
+) -> tuple[Float, Float, Float, Float, float, float]:
     """Fit contour points to a mask's boundary and to the image's own edges, each weighted by its measured variance.
 
     Args:

@@ -15,9 +15,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float, Float32, UInt8
 from hat_ros.refinement.view import Surfels, TargetViewer, View
-
-Float32 = NDArray[np.float32]
 
 # Points of the surface along the longer side of what is compared.
 _SIDE_POINTS = 48
@@ -48,7 +47,7 @@ class Sunlight:
     """
 
     distance: float
-    to_sun_cam: NDArray[np.float64]
+    to_sun_cam: Float
 
 
 class LightField:
@@ -61,7 +60,7 @@ class LightField:
         smooth: (H, W, 3) uint8 image whose pixels stand for what lies between them in the comparison.
     """
 
-    def __init__(self, image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> None:
+    def __init__(self, image: UInt8, mask: Bool) -> None:
         self.image = image
         self.mask = mask
         self.box = cv2.boundingRect(mask.view(np.uint8))
@@ -107,7 +106,7 @@ class SunMatcher:
         best = int(np.argmin(distance))
         return Sunlight(float(distance[best]), promising[best].astype(np.float64))
 
-    def _trial(self, scene: _Scene, R_cam_target: NDArray[np.float64], suns: Float32, max_pixels: int) -> NDArray:
+    def _trial(self, scene: _Scene, R_cam_target: Float, suns: Float32, max_pixels: int) -> NDArray:
         """Distance (S,) under each sun, without cast shadows, over at most about so many pixels in grey."""
         step = max(1, len(scene.seen.pixel) // max_pixels)
         normals = scene.seen.normals[::step] @ R_cam_target.T.astype(np.float32)
@@ -148,7 +147,7 @@ def brightness(cosine: Float32) -> Float32:
     return (cosine + np.float32(_AMBIENT)) ** np.float32(_GAMMA)
 
 
-def _even_directions(count: int) -> NDArray[np.float64]:
+def _even_directions(count: int) -> Float:
     """(count, 3) unit vectors spread evenly over the sphere (Fibonacci spiral)."""
     index = np.arange(count) + 0.5
     z = 1.0 - 2.0 * index / count
@@ -159,11 +158,11 @@ def _even_directions(count: int) -> NDArray[np.float64]:
 
 @njit(cache=True, nogil=True)
 def _light_beside(
-    image: NDArray[np.uint8],
-    mask: NDArray[np.bool_],
+    image: UInt8,
+    mask: Bool,
     box: tuple[int, int, int, int],
-    silhouette: NDArray[np.bool_],
-    origin_px: NDArray[np.float64],
+    silhouette: Bool,
+    origin_px: Float,
     scale: float,
 ) -> float:
     """Sum over colours and pixels of what is bright in a mask, in a box (x, y, width, height), beside a silhouette."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from hat_ros.array_types import Bool, Float, Float32, UInt8
 from hat_ros.geometry import lie
 from hat_ros.refinement.hits import facing, hit_points, image_box, normals_towards
 from hat_ros.target.contour import (
@@ -51,16 +52,16 @@ class View:
         lit: (h, w) bool part of the silhouette that the sun shines on; None when no sun is known.
     """
 
-    mask: NDArray[np.bool_]
-    depth_m: NDArray[np.float32]
+    mask: Bool
+    depth_m: Float32
     camera: Camera
-    origin_px: NDArray[np.float64]
+    origin_px: Float
     scale: float
-    T_cam_target: NDArray[np.float64]
+    T_cam_target: Float
     seen: Outlined
-    lit: NDArray[np.bool_] | None = None
+    lit: Bool | None = None
 
-    def shifted(self, shift_px: NDArray[np.float64]) -> View:
+    def shifted(self, shift_px: Float) -> View:
         """The same silhouette (2,) image pixels further."""
         return replace(self, origin_px=self.origin_px + shift_px)
 
@@ -77,9 +78,9 @@ class Surfels:
     """
 
     pixel: NDArray[np.intp]
-    points_m: NDArray[np.float32]
-    normals: NDArray[np.float32]
-    rgb: NDArray[np.uint8]
+    points_m: Float32
+    normals: Float32
+    rgb: UInt8
 
 
 class TargetViewer:
@@ -97,7 +98,7 @@ class TargetViewer:
         except QhullError:  # a flat model
             self._hull_m = target.vertices_m
 
-    def made_up(self, side_px: int) -> tuple[Camera, NDArray[np.float64]]:
+    def made_up(self, side_px: int) -> tuple[Camera, Float]:
         """Square camera and a (4, 4) pose at which it sees the whole target, to rehearse with."""
         camera = Camera(np.array([[side_px, 0, side_px / 2], [0, side_px, side_px / 2], [0, 0, 1.0]]), side_px, side_px)
         center_m = np.array([0.0, 0.0, 4.0 * self.target.bounding_radius_m])
@@ -105,10 +106,10 @@ class TargetViewer:
 
     def view(
         self,
-        T_cam_target: NDArray[np.float64],
+        T_cam_target: Float,
         camera: Camera,
         side_px: int,
-        to_sun_cam: NDArray[np.float64] | None = None,
+        to_sun_cam: Float | None = None,
     ) -> View | None:
         """The target at a pose, longer side ``side_px`` crop pixels; None when out of view or behind the camera.
 
@@ -137,7 +138,7 @@ class TargetViewer:
         view = View(seen.mask, seen.depth_m, crop, origin, scale, T_cam_target, seen)
         return view if to_sun_cam is None else self.in_sunlight(view, to_sun_cam)
 
-    def in_sunlight(self, view: View, to_sun_cam: NDArray[np.float64]) -> View:
+    def in_sunlight(self, view: View, to_sun_cam: Float) -> View:
         """The same view, and what of it a sun shines on: direction (3,) to it in the camera frame, any length."""
         seen = view.seen
         to_sun = (to_sun_cam / np.linalg.norm(to_sun_cam) @ view.T_cam_target[:3, :3]).astype(np.float32)
@@ -146,12 +147,12 @@ class TargetViewer:
         lit[seen.y, seen.x] = self._sunlit_hits(*seen.scattered, to_sun)
         return replace(view, lit=lit)
 
-    def bounds(self, T_cam_target: NDArray[np.float64], camera: Camera) -> NDArray[np.float64] | None:
+    def bounds(self, T_cam_target: Float, camera: Camera) -> Float | None:
         """Image box (x0, y0, x1, y1) around the target, None when it is not in front of the camera."""
         R, t = np.ascontiguousarray(T_cam_target[:3, :3]), np.ascontiguousarray(T_cam_target[:3, 3])
         return image_box(self._hull_m, R, t, camera.K, 1e-3 * self.target.bounding_radius_m)
 
-    def surface(self, directions: NDArray[np.float64], origin_m: NDArray[np.float64]) -> Surfels:
+    def surface(self, directions: Float, origin_m: Float) -> Surfels:
         """What rays (N, 3) from one point see, in the target frame."""
         directions = directions.astype(np.float32)
         origins = np.empty_like(directions)
@@ -171,7 +172,7 @@ class TargetViewer:
         rgb = self.target.surface.sample(face_id, np.stack([1.0 - u - v, u, v], axis=-1), self.target.face_rgb)
         return Surfels(at, points, normals_towards(directions[at], face_id, self._normals), rgb)
 
-    def _sunlit_hits(self, rays: Rays, hits: Hits, to_sun: NDArray[np.float32]) -> NDArray[np.bool_]:
+    def _sunlit_hits(self, rays: Rays, hits: Hits, to_sun: Float32) -> Bool:
         """Which of the rays (N,) hit something that the sun shines on."""
         origins, directions = rays
         at, points = hit_points(origins, directions, hits["primID"], hits["tfar"])
@@ -180,9 +181,7 @@ class TargetViewer:
         lit[at] = self.sunlit(points, normals, to_sun) > 0
         return lit
 
-    def sunlit(
-        self, points_m: NDArray[np.float32], normals: NDArray[np.float32], to_sun: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
+    def sunlit(self, points_m: Float32, normals: Float32, to_sun: Float32) -> Float32:
         """Cosine of the sun's incidence (N,) at points that the camera sees, 0 where the sun does not reach.
 
         Args:
@@ -207,8 +206,8 @@ class ContourLines:
             the image.
     """
 
-    points_m: NDArray[np.float64]
-    lines: NDArray[np.float64]
+    points_m: Float
+    lines: Float
 
     @property
     def length_px(self) -> float:

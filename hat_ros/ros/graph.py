@@ -21,10 +21,10 @@ from typing import IO, Any
 import numpy as np
 import rclpy
 import yaml
-from numpy.typing import NDArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
+from hat_ros.array_types import Float
 from hat_ros.config import HatConfig, config_to_dict
 from hat_ros.errors import ConfigError, HatError, InputError, RunError, StageTimeoutError
 from hat_ros.io import topics
@@ -77,7 +77,7 @@ class ReplayResult:
     answered: int
     dropped: int
     wall_s: float
-    latency_ms: NDArray[np.float64]
+    latency_ms: Float
     peak_memory_mib: float
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool
 from hat_ros.config import HatConfig
 from hat_ros.target.model import Target
 from hat_ros.types import Detection, Frame, PosePrior
@@ -40,7 +40,7 @@ class AnnotatedSegmenter:
         """Nothing is learned."""
 
 
-def pad_box(box: NDArray[np.bool_], padding: float) -> NDArray[np.bool_]:
+def pad_box(box: Bool, padding: float) -> Bool:
     """The tight box of an (H, W) mask, grown by ``padding`` of its width and height on each side, clipped, filled."""
     rows, cols = np.flatnonzero(box.any(axis=1)), np.flatnonzero(box.any(axis=0))
     out = np.zeros_like(box)

@@ -10,7 +10,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+
+from hat_ros.array_types import Int32, UInt8
 
 # Fewer known pixels of one side around a pixel tell nothing about that side.
 _MIN_PIXELS = 12
@@ -18,7 +19,7 @@ _MIN_PIXELS = 12
 _WIDE_BAND_PX = 4
 
 
-def refine_outline(rgb: NDArray[np.uint8], mask: NDArray[np.uint8], band_px: int, contrast: float) -> NDArray[np.uint8]:
+def refine_outline(rgb: UInt8, mask: UInt8, band_px: int, contrast: float) -> UInt8:
     """Move the outline of a mask by up to ``band_px`` pixels to where the local colours change.
 
     Args:
@@ -55,13 +56,13 @@ def rehearse() -> None:
     refine_outline(np.zeros((16, 16, 3), np.uint8), mask, 1, 1.0)
 
 
-def _every_second(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _every_second(image: UInt8) -> UInt8:
     """Every second pixel of every second row of an (h, w, ...) image, an odd rest dropped."""
     h, w = image.shape[0] // 2, image.shape[1] // 2
     return cv2.resize(image[: 2 * h, : 2 * w], (w, h), interpolation=cv2.INTER_NEAREST)
 
 
-def _area_table(rgb: NDArray[np.uint8], mask: NDArray[np.uint8]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def _area_table(rgb: UInt8, mask: UInt8) -> tuple[Int32, Int32]:
     """Summed-area tables (h + 1, w + 1) of a 0/1 mask and (h + 1, w + 1, 3) of the colours in it."""
     return cv2.integral(mask, sdepth=cv2.CV_32S), cv2.integral(cv2.copyTo(rgb, mask), sdepth=cv2.CV_32S)
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float32, UInt8
 from hat_ros.segmentation.masks import Mask, enlarge
 from hat_ros.segmentation.sky import SKY_MAX, Sky, level_and_noise
 
@@ -52,9 +52,9 @@ def with_dim_parts(measured: Sky, lit: Mask) -> Mask:
 
 
 def _find(
-    luma: NDArray[np.float32],
-    bright: NDArray[np.bool_],
-    seen: NDArray[np.bool_],
+    luma: Float32,
+    bright: Bool,
+    seen: Bool,
     step: float,
     ladder: list[tuple[int, float, float]],
 ) -> Mask:
@@ -87,7 +87,7 @@ def _find(
     return found
 
 
-def _noise(image: NDArray[np.uint8], width: int, factor: int) -> tuple[int, float, float] | None:
+def _noise(image: UInt8, width: int, factor: int) -> tuple[int, float, float] | None:
     """A rung of the ladder: the width in reduced pixels, the sky's level and a threshold that its noise stays below.
 
     From strips along the border of an (H, W) image; None when that is too small or not dark.
@@ -105,7 +105,7 @@ def _noise(image: NDArray[np.uint8], width: int, factor: int) -> tuple[int, floa
     return n, level, max(_NOISE_SIGMAS * sigma, _MIN_STEP)
 
 
-def _reduced(image: NDArray[np.uint8] | NDArray[np.float32], factor: int, whole: bool = False) -> NDArray[np.float32]:
+def _reduced(image: UInt8 | Float32, factor: int, whole: bool = False) -> Float32:
     """Means of ``factor`` x ``factor`` pixels; ``whole`` ones only, what is left at the far sides dropped."""
     size = (-(-image.shape[1] // factor), -(-image.shape[0] // factor))
     if whole:
@@ -115,5 +115,5 @@ def _reduced(image: NDArray[np.uint8] | NDArray[np.float32], factor: int, whole:
     return image if factor == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
-def _disc(radius_px: int) -> NDArray[np.uint8]:
+def _disc(radius_px: int) -> UInt8:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius_px + 1, 2 * radius_px + 1))

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Float32, UInt8
 from hat_ros.segmentation.masks import Mask, touches_border
 from hat_ros.segmentation.sky import Sky, dark_border_share, lit_regions, measure_sky
 
@@ -38,12 +38,12 @@ class Space:
         regions: what is lit in it, see :func:`hat_ros.segmentation.sky.lit_regions`.
     """
 
-    rgb: NDArray[np.uint8]
+    rgb: UInt8
     sky: Sky
     regions: list[Mask]
 
 
-def look_into_space(rgb: NDArray[np.uint8], border_share: float) -> Space | None:
+def look_into_space(rgb: UInt8, border_share: float) -> Space | None:
     """The sky in an (H, W, 3) uint8 image and what is lit before it; None unless so much of the border is black sky.
 
     Stray light is taken off first where it hides that sky, or where the brightest region fades out instead of ending;
@@ -58,7 +58,7 @@ def look_into_space(rgb: NDArray[np.uint8], border_share: float) -> Space | None
     return space if cleared is None or _is_hazy(cleared) else cleared
 
 
-def _measured(rgb: NDArray[np.uint8], border_share: float) -> Space | None:
+def _measured(rgb: UInt8, border_share: float) -> Space | None:
     sky = measure_sky(rgb)
     return Space(rgb, sky, lit_regions(sky)) if sky.border_share >= border_share else None
 
@@ -79,7 +79,7 @@ def fades_out(measured: Sky, region: Mask) -> bool:
     return np.count_nonzero(around > half) > most * len(around)
 
 
-def without_glow(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def without_glow(rgb: UInt8) -> UInt8:
     """An (H, W, 3) uint8 image with its glow taken off, the sky at a low grey level."""
     h, w = rgb.shape[:2]
     scale = min(1.0, _SIDE_PX / max(h, w))
@@ -90,7 +90,7 @@ def without_glow(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return cv2.subtract(rgb, glow - _PEDESTAL, dtype=cv2.CV_8U)
 
 
-def _smooth_from_border(image: NDArray[np.float32]) -> Mask:
+def _smooth_from_border(image: Float32) -> Mask:
     """What can be reached from the border of an (h, w, 3) image in small steps, 0/1."""
     brightness = np.log(image + _ADDED_LEVELS)
     h, w = brightness.shape[:2]
@@ -103,7 +103,7 @@ def _smooth_from_border(image: NDArray[np.float32]) -> Mask:
     return reached[1:-1, 1:-1]
 
 
-def _continued(image: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[np.float32]:
+def _continued(image: Float32, known: Float32) -> Float32:
     """An (h, w, 3) image continued smoothly where it is not known, 0/1: by its own reduced version there."""
     h, w = known.shape
     if known.all() or min(h, w) <= 2:

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Float, UInt8
 from hat_ros.geometry.masks import overlap
 from hat_ros.segmentation.masks import Mask, Window
 
@@ -81,7 +81,7 @@ class GroundEvidence:
 class _Remembered:
     """A frame at reduced scale, and where the target was not (0/1)."""
 
-    rgb: NDArray[np.uint8]
+    rgb: UInt8
     free: Mask
 
 
@@ -97,10 +97,10 @@ class GroundMemory:
         self._H_now_then = _NO_MOTION  # homographies of the frames to the newest
         self._points = _NO_POINTS
         self._n_chosen = 0  # points to start with
-        self._grey: NDArray[np.uint8] | None = None
+        self._grey: UInt8 | None = None
         self._scale = (1.0, 1.0)
 
-    def push(self, rgb: NDArray[np.uint8], mask_before: Mask | None) -> Window:
+    def push(self, rgb: UInt8, mask_before: Mask | None) -> Window:
         """Add the newest frame, (H, W, 3) uint8, and say where the target was in the one before, if that is known.
 
         Returns:
@@ -125,7 +125,7 @@ class GroundMemory:
         self._scale = (small.shape[1] / rgb.shape[1], small.shape[0] / rgb.shape[0])
         return whole
 
-    def _follow(self, grey: NDArray[np.uint8]) -> NDArray[np.float64] | None:
+    def _follow(self, grey: UInt8) -> Float | None:
         """(3, 3) homography that most point tracks follow into the next frame outside the target; None without one."""
         free, points = self._frames[-1].free, self._points
         if len(points):
@@ -150,7 +150,7 @@ class GroundMemory:
         self._points = tracked[good][follows.ravel() == 1]
         return H
 
-    def _carry(self, H_next_prev: NDArray[np.float64] | None) -> None:
+    def _carry(self, H_next_prev: Float | None) -> None:
         """Take the next frame's view; forget what is too close to its neighbour, or all where the ground was lost."""
         if H_next_prev is None:
             self._frames, self._H_now_then = [], _NO_MOTION
@@ -196,14 +196,14 @@ class GroundMemory:
         usable = shifts_px[shifts_px <= _MAX_SHIFT * max(window.width, window.height)]
         return float(usable.max(initial=0.0)) / _LAGS[-1]
 
-    def _shifts_px(self, window: Window) -> NDArray[np.float64]:
+    def _shifts_px(self, window: Window) -> Float:
         """(n,) how far the ground in the middle of a window has moved since each past frame, full resolution."""
         sx, sy = self._scale
         middle = ((window.x0 + window.width / 2) * sx, (window.y0 + window.height / 2) * sy)
         dx, dy = (_carried(self._H_now_then[:-1], middle) - middle).T
         return np.sqrt(dx * dx + dy * dy) / sx
 
-    def _to_window(self, window: Window) -> NDArray[np.float64]:
+    def _to_window(self, window: Window) -> Float:
         """(3, 3) from the remembered scale to a window's, pixel centres at integers."""
         (sx, sy), (h, w) = self._scale, window.rgb.shape[:2]
         u, v = w / window.width, h / window.height
@@ -226,13 +226,13 @@ class GroundMemory:
         return list(chosen.items())
 
 
-def _carried(H_now_then: NDArray[np.float64], at: tuple[float, float]) -> NDArray[np.float64]:
+def _carried(H_now_then: Float, at: tuple[float, float]) -> Float:
     """(n, 2) where the ground that was at a point in each frame is now: by (n, 3, 3) homographies."""
     now = H_now_then @ np.array([*at, 1.0])
     return now[:, :2] / now[:, 2:]
 
 
-def _least(changes: list[tuple[NDArray[np.uint8], Mask]]) -> tuple[NDArray[np.uint8], Mask]:
+def _least(changes: list[tuple[UInt8, Mask]]) -> tuple[UInt8, Mask]:
     """The least of several changes (h, w), and where enough frames have seen the ground to say so, 0/1.
 
     Where the target was before differs too, but not in the same place in two frames.
@@ -245,9 +245,7 @@ def _least(changes: list[tuple[NDArray[np.uint8], Mask]]) -> tuple[NDArray[np.ui
     return least, (count >= min(2, len(changes))).astype(np.uint8)
 
 
-def _compare(
-    now: NDArray[np.uint8], then: _Remembered, H: NDArray[np.float64]
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+def _compare(now: UInt8, then: _Remembered, H: Float) -> tuple[UInt8, UInt8]:
     """Colour distance (h, w) of each pixel to the range of ground colours around its earlier place, which forgives
     half a pixel of shift, and where the ground was seen, 0/1."""
     size = now.shape[1::-1]

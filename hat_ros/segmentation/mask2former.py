@@ -14,9 +14,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from transformers import Mask2FormerForUniversalSegmentation, Mask2FormerImageProcessorPil
 
+from hat_ros.array_types import Bool, Float32
 from hat_ros.config import HatConfig, Mask2FormerConfig
 from hat_ros.errors import WeightsError
 from hat_ros.nets.checkpoint import find
@@ -41,7 +41,7 @@ class Mask2FormerSegmenter:
         folder = find("mask2former", config.nets.weights_folder or None)
         self._processor, model = _load(folder)
         self._model = model.to(self._runtime.device).eval().requires_grad_(False)
-        self._previous: NDArray[np.bool_] | None = None
+        self._previous: Bool | None = None
 
     @torch.inference_mode()
     def update(self, frame: Frame, prior: PosePrior | None) -> Detection | None:
@@ -104,11 +104,11 @@ def instances(
 
 
 def choose(
-    masks: NDArray[np.bool_],
-    scores: NDArray[np.float32],
-    previous: NDArray[np.bool_] | None,
+    masks: Bool,
+    scores: Float32,
+    previous: Bool | None,
     settings: Mask2FormerConfig,
-) -> NDArray[np.bool_] | None:
+) -> Bool | None:
     """The instance that is the target: (N, H, W), (N,) -> (H, W), or None.
 
     Merit = score x (1 + square root of the share of the image) + weighted compactness (share of the convex hull that
@@ -128,7 +128,7 @@ def choose(
     return best
 
 
-def _compactness(mask: NDArray[np.bool_]) -> float:
+def _compactness(mask: Bool) -> float:
     points = cv2.findNonZero(mask.astype(np.uint8))
     hull = cv2.contourArea(cv2.convexHull(points))
     return min(np.count_nonzero(mask) / max(hull, 1.0), 1.0)

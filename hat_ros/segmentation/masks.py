@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Mask = NDArray[np.uint8]
+from hat_ros.array_types import Float, UInt8
+
+Mask = UInt8
 
 SIDES = ("top", "bottom", "left", "right")
 
@@ -69,7 +70,7 @@ def moved(mask: Mask, dx: int, dy: int) -> Mask:
     return out
 
 
-def centroid(mask: Mask) -> NDArray[np.float64]:
+def centroid(mask: Mask) -> Float:
     """Centre of gravity (x, y) in pixels of a mask that is not empty."""
     x, y, w, h = cv2.boundingRect(mask)
     m = cv2.moments(mask[y : y + h, x : x + w], binaryImage=True)
@@ -84,7 +85,7 @@ def shift_between(before: Mask | None, mask: Mask | None) -> tuple[int, int]:
     return int(dx), int(dy)
 
 
-def _reduced(rgb: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+def _reduced(rgb: UInt8, size: tuple[int, int]) -> UInt8:
     """A picture at a smaller size (width, height) by area; halving first is several times faster."""
     h, w = rgb.shape[:2]
     if min(w // size[0], h // size[1]) >= 4 and w % 2 == h % 2 == 0:
@@ -101,10 +102,10 @@ class Window:
     width: int
     height: int
     scale: float
-    rgb: NDArray[np.uint8]
+    rgb: UInt8
 
     @classmethod
-    def whole(cls, rgb: NDArray[np.uint8], side_px: int, reduced: Window | None = None) -> Window:
+    def whole(cls, rgb: UInt8, side_px: int, reduced: Window | None = None) -> Window:
         """The whole image, its longer side reduced to at most ``side_px``; faster from a larger such window."""
         h, w = rgb.shape[:2]
         scale = min(1.0, side_px / max(h, w))
@@ -113,9 +114,7 @@ class Window:
         return cls(0, 0, w, h, scale, _reduced(source, size))
 
     @classmethod
-    def around(
-        cls, rgb: NDArray[np.uint8], box: tuple[int, int, int, int], margin: float, side_px: int
-    ) -> Window | None:
+    def around(cls, rgb: UInt8, box: tuple[int, int, int, int], margin: float, side_px: int) -> Window | None:
         """The image around a box (x0, y0, x1, y1), reduced likewise; None when hardly any of it is inside."""
         h, w = rgb.shape[:2]
         m = round(margin)

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float, Float32, UInt8
 from hat_ros.segmentation.masks import Window
 
 _MAX_LAG = 8  # frames
@@ -37,14 +37,14 @@ class MotionEvidence:
         still: (h, w) uint8 0/1, texture that moved with the background.
     """
 
-    moving: NDArray[np.uint8]
-    still: NDArray[np.uint8]
+    moving: UInt8
+    still: UInt8
 
-    def found_share(self, mask: NDArray[np.uint8]) -> float:
+    def found_share(self, mask: UInt8) -> float:
         """Share of what moves that a 0/1 mask contains, or has close by: what a target uncovers moves too."""
         return np.count_nonzero(self.moving & cv2.dilate(mask, _K7)) / np.count_nonzero(self.moving)
 
-    def still_share(self, mask: NDArray[np.uint8]) -> float:
+    def still_share(self, mask: UInt8) -> float:
         """Share of a 0/1 mask, outline left out, that is background texture."""
         inside = cv2.erode(mask, _K5, borderType=cv2.BORDER_REPLICATE)
         return np.count_nonzero(self.still & inside) / max(1, np.count_nonzero(inside))
@@ -59,9 +59,9 @@ class MotionDetector:
 
     def __init__(self, side_px: int) -> None:
         self._side_px = side_px
-        self._frames: deque[NDArray[np.uint8]] = deque(maxlen=_MAX_LAG + 1)
+        self._frames: deque[UInt8] = deque(maxlen=_MAX_LAG + 1)
 
-    def push(self, rgb: NDArray[np.uint8]) -> None:
+    def push(self, rgb: UInt8) -> None:
         """Add the newest frame, (h, w, 3) uint8, reduced; a change of size starts afresh."""
         if self._frames and self._frames[-1].shape != rgb.shape:
             self._frames.clear()
@@ -87,7 +87,7 @@ class MotionDetector:
         return MotionEvidence(moving, still.astype(np.uint8))
 
 
-def _compare(now: NDArray[np.uint8], before: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+def _compare(now: UInt8, before: UInt8) -> tuple[UInt8, UInt8]:
     """How the newest frame differs from an earlier one that follows the background.
 
     Returns:
@@ -113,7 +113,7 @@ def _compare(now: NDArray[np.uint8], before: NDArray[np.uint8]) -> tuple[NDArray
     return cv2.max(above, below).max(axis=2) * best_seen, np.where(best_seen, best_change, 255)
 
 
-def _shifts(before: NDArray[np.float32], now: NDArray[np.float32]) -> list[NDArray[np.float64]]:
+def _shifts(before: Float32, now: Float32) -> list[Float]:
     """Candidate shifts as 2x3 matrices: none, of the whole image, and of each of its halves."""
     h, w = now.shape
     parts = np.s_[:, :], np.s_[: h // 2], np.s_[h // 2 :], np.s_[:, : w // 2], np.s_[:, w // 2 :]
@@ -126,7 +126,7 @@ def _shifts(before: NDArray[np.float32], now: NDArray[np.float32]) -> list[NDArr
     return out
 
 
-def _border(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def _border(shape: tuple[int, ...]) -> Bool:
     width = max(2, round(_BORDER_SHARE * min(shape)))
     border = np.ones(shape, bool)
     border[width:-width, width:-width] = False

@@ -11,8 +11,8 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import UInt8
 from hat_ros.segmentation.masks import Mask, fill_holes
 from hat_ros.segmentation.region import tidy
 
@@ -33,7 +33,7 @@ _BESIDE_PX = 2  # outlines lie on both sides of a mask's own
 _K3 = np.ones((3, 3), np.uint8)
 
 
-def is_grey(rgb: NDArray[np.uint8]) -> bool:
+def is_grey(rgb: UInt8) -> bool:
     """Whether an (H, W, 3) image holds no colour at all, as from a monochrome camera."""
     red, green, blue = cv2.split(rgb)
     return np.array_equal(red, green) and np.array_equal(red, blue)
@@ -47,7 +47,7 @@ class SharpOutlines:
         size: width and height of the masks that are made and judged.
     """
 
-    def __init__(self, grey: NDArray[np.uint8], size: tuple[int, int]) -> None:
+    def __init__(self, grey: UInt8, size: tuple[int, int]) -> None:
         dx = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=3, scale=0.25)
         dy = cv2.Sobel(grey, cv2.CV_32F, 0, 1, ksize=3, scale=0.25)
         low, high = np.percentile(grey, _RANGE_PERCENT)

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Float, Float32, UInt8
 from hat_ros.segmentation.ground import GroundEvidence
 from hat_ros.segmentation.masks import SIDES, Mask, fill_holes
 
@@ -29,8 +29,8 @@ _K3 = np.ones((3, 3), np.uint8)
 class ColorModels:
     """Mixtures of five Gaussians in RGB for both sides, in GrabCut's own layout; adapted by every cut."""
 
-    background: NDArray[np.float64] = field(default_factory=lambda: np.zeros((1, 65)))
-    foreground: NDArray[np.float64] = field(default_factory=lambda: np.zeros((1, 65)))
+    background: Float = field(default_factory=lambda: np.zeros((1, 65)))
+    foreground: Float = field(default_factory=lambda: np.zeros((1, 65)))
 
     def copy(self) -> ColorModels:
         """The same models, free to adapt differently."""
@@ -58,7 +58,7 @@ class ClearCut:
     vouched: bool = False
 
 
-def graph_cut(rgb: NDArray[np.uint8], labels: Mask, models: ColorModels, iterations: int) -> Mask | None:
+def graph_cut(rgb: UInt8, labels: Mask, models: ColorModels, iterations: int) -> Mask | None:
     """(h, w) 0/1 mask from GrabCut labels (cv2.GC_*), None when one side is empty; the models adapt to it."""
     foreground = int(np.count_nonzero(labels & 1))
     if foreground < 8 or labels.size - foreground < 8:
@@ -71,7 +71,7 @@ def graph_cut(rgb: NDArray[np.uint8], labels: Mask, models: ColorModels, iterati
 
 
 def cut_from_seeds(
-    rgb: NDArray[np.uint8],
+    rgb: UInt8,
     seeds: list[Mask],
     margin_px: float,
     models: ColorModels,
@@ -114,7 +114,7 @@ def _note_ground(labels: Mask, seen: GroundEvidence, some: Mask, near: Mask) -> 
 
 
 def cut_from_nothing(
-    rgb: NDArray[np.uint8],
+    rgb: UInt8,
     open_side: str | None = None,
     near: Mask | None = None,
     iterations: int = _COLD_ITERATIONS,
@@ -161,11 +161,11 @@ def near_sides(closed: Mask) -> tuple[str, ...]:
     return tuple(side for side, gap in zip(SIDES, gaps, strict=True) if gap <= reach)
 
 
-def _ring_px(image: NDArray[np.uint8]) -> int:
+def _ring_px(image: UInt8) -> int:
     return max(2, round(_RING_SHARE * max(image.shape[:2])))
 
 
-def cut_from_motion(rgb: NDArray[np.uint8], moving: Mask, iterations: int = _COLD_ITERATIONS) -> Mask | None:
+def cut_from_motion(rgb: UInt8, moving: Mask, iterations: int = _COLD_ITERATIONS) -> Mask | None:
     """Cut around what moved, (h, w) 0/1: parts of the target, rarely all of it, and nothing far from it.
 
     ``iterations`` as for :func:`cut_from_nothing`.
@@ -196,7 +196,7 @@ def tidy(mask: Mask, anchor: Mask | None) -> Mask | None:
     return fill_holes(keep.astype(np.uint8)[label], 0.05)
 
 
-def edge_contrast(step: NDArray[np.float32], mask: Mask) -> float:
+def edge_contrast(step: Float32, mask: Mask) -> float:
     """How clearly a mask's outline shows: lower quartile of the colour steps (h, w) along it; 0 without an outline."""
     outer = cv2.dilate(mask, np.ones((3, 3), np.uint8))
     inner = cv2.erode(mask, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
@@ -207,13 +207,13 @@ def edge_contrast(step: NDArray[np.float32], mask: Mask) -> float:
     return float(np.partition(steps, len(steps) // 4)[len(steps) // 4]) if len(steps) >= 8 else 0.0
 
 
-def chance_contrast(step: NDArray[np.float32], mask: Mask) -> float:
+def chance_contrast(step: Float32, mask: Mask) -> float:
     """Median of the colour steps (h, w) in the background, where an outline drawn by chance would lie."""
     away = cv2.dilate(mask, np.ones((7, 7), np.uint8)) == 0
     return float(np.median(step[away])) if away.any() else 0.0
 
 
-def color_step(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+def color_step(rgb: UInt8) -> Float32:
     """Colour step (8-bit, across two pixels) at each pixel of an (h, w, 3) image."""
     dx = cv2.Sobel(rgb, cv2.CV_32F, 1, 0, ksize=3, scale=0.25)
     dy = cv2.Sobel(rgb, cv2.CV_32F, 0, 1, ksize=3, scale=0.25)

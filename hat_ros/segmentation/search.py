@@ -8,8 +8,8 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import UInt8
 from hat_ros.config import ClassicalConfig
 from hat_ros.geometry.masks import overlap
 from hat_ros.segmentation import region
@@ -64,7 +64,7 @@ class Found:
 class _Newest:
     """The newest frame at the scale of a search, reduced once somebody asks."""
 
-    rgb: NDArray[np.uint8]
+    rgb: UInt8
     remembered: Window
     detector: MotionDetector
     side_px: int
@@ -107,7 +107,7 @@ class Search:
         self.ground.reset()
         self._turn = 0
 
-    def push(self, rgb: NDArray[np.uint8], mask_before: Mask | None = None) -> None:
+    def push(self, rgb: UInt8, mask_before: Mask | None = None) -> None:
         """Show it the newest image, (H, W, 3) uint8, and the previous one's mask; to be called once per frame."""
         remembered = self.ground.push(rgb, mask_before)
         self._newest = _Newest(rgb, remembered, self._motion, self._config.cold_side_px)
@@ -135,7 +135,7 @@ class Search:
             cut = region.cut_from_nothing(self._newest.window.rgb, kind, small, _GLANCE_ITERATIONS)
         return cut is not None and overlap(cut, small) >= AGREEMENT
 
-    def find(self, rgb: NDArray[np.uint8], open_sides: tuple[str, ...]) -> Found | None:
+    def find(self, rgb: UInt8, open_sides: tuple[str, ...]) -> Found | None:
         """Find the target from nothing.
 
         Args:
@@ -183,7 +183,7 @@ class Search:
         contrast = region.edge_contrast(region.color_step(window.rgb), cut)
         return Found(at_full_resolution(rgb, window, cut), best_score, contrast, models)
 
-    def around(self, rgb: NDArray[np.uint8], silhouette: Mask) -> Found | None:
+    def around(self, rgb: UInt8, silhouette: Mask) -> Found | None:
         """The target where a pose that the image has supported says that it is; None unless it shows there."""
         x, y, w, h = cv2.boundingRect(silhouette)
         margin = margin_px(silhouette)
@@ -206,7 +206,7 @@ class Search:
         plausibility, required = self.judge(mask)
         return Found(mask, plausibility, contrast, models) if plausibility >= required else None
 
-    def before_ground(self, rgb: NDArray[np.uint8]) -> Found | None:
+    def before_ground(self, rgb: UInt8) -> Found | None:
         """What stands before the ground, once so much of that is known that it is the whole target."""
         whole = Window.whole(rgb, _GROUND_SIDE_PX)
         length_px = self.ground.length_known_px(whole)
@@ -269,7 +269,7 @@ class Search:
         return required + (CUT_SURCHARGE if motion is not None else _UNMOVED_SURCHARGE)
 
 
-def _cold_cuts(rgb: NDArray[np.uint8], motion: MotionEvidence | None, open_sides: tuple[str, ...]) -> list[Mask | None]:
+def _cold_cuts(rgb: UInt8, motion: MotionEvidence | None, open_sides: tuple[str, ...]) -> list[Mask | None]:
     """The closed cut, the one from motion if there is any, and one for each open side that the closed cut is near.
 
     Two at a time: a search takes as long as several frames and must not hold up the next one for longer than it has to.
@@ -291,7 +291,7 @@ def margin_px(mask: Mask) -> float:
     return _MARGIN_PX + _MARGIN_SHARE * max(w, h)
 
 
-def at_full_resolution(rgb: NDArray[np.uint8], window: Window, cut: Mask) -> Mask:
+def at_full_resolution(rgb: UInt8, window: Window, cut: Mask) -> Mask:
     """A cut in a window as an (H, W) mask, its outline found anew at full resolution."""
     rows, cols = slice(window.y0, window.y0 + window.height), slice(window.x0, window.x0 + window.width)
     band = max(2, round(1 / window.scale) + 1)

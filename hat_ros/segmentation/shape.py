@@ -11,8 +11,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float, Float32, UInt8
 from hat_ros.geometry import lie
 from hat_ros.target.model import Target
 from hat_ros.target.rendering import Renderer
@@ -57,7 +57,7 @@ class SilhouetteBank:
         self._spectra = np.ascontiguousarray(spectra.transpose(2, 0, 1))  # frequency, view, radius
         self._areas = np.einsum("vra,r->v", views, self._weight)
 
-    def overlap(self, mask: NDArray[np.bool_]) -> float:
+    def overlap(self, mask: Bool) -> float:
         """Best intersection over union of an (H, W) mask with any silhouette, 0 to 1."""
         if not mask.any():
             return 0.0
@@ -73,7 +73,7 @@ class SilhouetteBank:
             best = max(best, self._overlap_at(_polar(image, at, size), _polar(inside, at, size)))
         return best
 
-    def _overlap_at(self, polar: NDArray[np.float32], known: NDArray[np.float32] | None) -> float:
+    def _overlap_at(self, polar: Float32, known: Float32 | None) -> float:
         inter = self._correlate(polar)
         area = float(polar.sum(axis=1) @ self._weight)
         areas = self._areas[:, None]
@@ -81,14 +81,14 @@ class SilhouetteBank:
             areas = self._correlate(known)
         return float((inter / np.maximum(areas + area - inter, 1e-9)).max())
 
-    def _correlate(self, polar: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _correlate(self, polar: Float32) -> Float32:
         """Area (views, angles) that a polar image shares with every silhouette at every angle."""
         spectrum = np.fft.rfft(polar, axis=-1).astype(np.complex64)
         shared = np.matmul(self._spectra, spectrum.T[:, :, None])[:, :, 0]
         return np.fft.irfft(shared.T, n=_ANGLES, axis=-1)
 
 
-def _looking_along(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+def _looking_along(direction: Float) -> Float:
     """A rotation target -> camera whose optical axis has this direction in the target frame; the roll is arbitrary."""
     helper = np.eye(3)[np.argmin(np.abs(direction))]
     x = np.cross(helper, direction)
@@ -96,14 +96,14 @@ def _looking_along(direction: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([x, np.cross(direction, x), direction])
 
 
-def _moments(mask: NDArray[np.bool_]) -> tuple[NDArray[np.float64], float]:
+def _moments(mask: Bool) -> tuple[Float, float]:
     """Centroid (x, y) and radius of gyration of a mask in pixels."""
     m = cv2.moments(mask.astype(np.uint8), binaryImage=True)
     center = np.array([m["m10"], m["m01"]]) / m["m00"]
     return center, max(float(np.sqrt((m["mu20"] + m["mu02"]) / m["m00"])), 0.5)
 
 
-def _polar(image: NDArray[np.uint8], center: NDArray[np.float64], radius: float) -> NDArray[np.float32]:
+def _polar(image: UInt8, center: Float, radius: float) -> Float32:
     """(radii, angles) samples of a binary image about a centre; 0 outside the image."""
     r = (np.arange(_RADII) + 0.5) * (_EXTENT / _RADII * radius)
     angle = np.arange(_ANGLES) * (2 * np.pi / _ANGLES)
@@ -112,7 +112,7 @@ def _polar(image: NDArray[np.uint8], center: NDArray[np.float64], radius: float)
     return cv2.remap(image.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
 
 
-def _cut_direction(mask: NDArray[np.bool_]) -> NDArray[np.float64] | None:
+def _cut_direction(mask: Bool) -> Float | None:
     """Unit vector from the mask's middle towards where the image border cuts it, or None."""
     weights = np.array([mask[:, 0].sum(), mask[:, -1].sum(), mask[0].sum(), mask[-1].sum()], dtype=np.float64)
     if not weights.any():

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float32, UInt8
 from hat_ros.segmentation.masks import Mask, fill_holes, touches_border
 
 # A sky pixel is at most this bright (8-bit, any channel); black level and noise of real cameras stay below. In an image
@@ -54,14 +54,14 @@ class Sky:
         border_share: share of the image border that is sky, 0 when there is none.
     """
 
-    luma: NDArray[np.uint8]
-    mean3: NDArray[np.float32]
+    luma: UInt8
+    mean3: Float32
     level: float
     threshold: float
     border_share: float
 
 
-def measure_sky(rgb: NDArray[np.uint8]) -> Sky:
+def measure_sky(rgb: UInt8) -> Sky:
     """Level and noise of the sky from the image border: (H, W, 3) uint8."""
     luma = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     around = cv2.dilate(luma, _NEIGHBOURS)
@@ -77,26 +77,26 @@ def measure_sky(rgb: NDArray[np.uint8]) -> Sky:
     return Sky(luma, mean3, level, threshold, float(np.count_nonzero(dark <= threshold)) / ring.size)
 
 
-def level_and_noise(values: NDArray[np.float32]) -> tuple[float, float]:
+def level_and_noise(values: Float32) -> tuple[float, float]:
     """Median of (n,) values and their standard deviation about it, without those that lie far off."""
     level = _median(values)
     return level, 1.4826 * _median(np.abs(values - level))
 
 
-def _median(values: NDArray[np.float32]) -> float:
+def _median(values: Float32) -> float:
     """``np.median`` without most of its overhead."""
     half = len(values) // 2
     low = half - 1 + len(values) % 2
     return float(np.partition(values, (low, half))[low : half + 1].mean())
 
 
-def dark_border_share(rgb: NDArray[np.uint8]) -> float:
+def dark_border_share(rgb: UInt8) -> float:
     """Share of the image border that is dark enough to be sky, at a glance: never less than ``Sky.border_share``."""
     dark = _dark_border(rgb)
     return np.count_nonzero(dark) / max(1, len(dark))
 
 
-def _dark_border(rgb: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def _dark_border(rgb: UInt8) -> Bool:
     """Which pixels of the border are black in every channel, and have no colour."""
     red, green, blue = np.concatenate([rgb[strip].reshape(-1, 3) for strip in _border(rgb.shape)]).T
     brightest = np.maximum(np.maximum(red, green), blue)
@@ -110,7 +110,7 @@ def _border(shape: tuple[int, ...]) -> tuple[tuple[slice, slice], ...]:
     return np.s_[1:r:2, ::2], np.s_[-r:-1:2, ::2], np.s_[r:-r:2, 1:r:2], np.s_[r:-r:2, -r:-1:2]
 
 
-def lit_regions(sky: Sky) -> list[NDArray[np.uint8]]:
+def lit_regions(sky: Sky) -> list[UInt8]:
     """Bright objects, largest first, each (H, W) uint8 of 0 and 1: connected pieces and what lies close to them."""
     bright = (sky.mean3 > sky.threshold).astype(np.uint8)
     gap = max(2, round(0.006 * max(bright.shape)))
@@ -160,7 +160,7 @@ def _groups(bright: Mask, gap: int) -> list[tuple[Box, Mask]]:
     return out
 
 
-def _trim_outline(region: Mask, luma: NDArray[np.uint8], peak: NDArray[np.uint8], sky: Sky) -> Mask:
+def _trim_outline(region: Mask, luma: UInt8, peak: UInt8, sky: Sky) -> Mask:
     """Take off what blur and the 3 x 3 mean added around the outline; ``peak`` is the brightest pixel near each."""
     region = fill_holes(region, _HOLE_SHARE)
     inner = cv2.erode(region, _K5, borderType=cv2.BORDER_REPLICATE)
@@ -172,7 +172,7 @@ def _trim_outline(region: Mask, luma: NDArray[np.uint8], peak: NDArray[np.uint8]
     return inner
 
 
-def join_parts(regions: list[NDArray[np.uint8]], main: int) -> NDArray[np.uint8]:
+def join_parts(regions: list[UInt8], main: int) -> UInt8:
     """The main region with the others that lie within half its size of it: parts cut off by shadow.
 
     What the image border cuts is not joined to what it does not cut: that may be a planet.
@@ -190,7 +190,7 @@ def join_parts(regions: list[NDArray[np.uint8]], main: int) -> NDArray[np.uint8]
     return out
 
 
-def lit_share(lit: NDArray[np.uint8]) -> float:
+def lit_share(lit: UInt8) -> float:
     """How much of a body is lit, 0 to 1: share of an (H, W) 0/1 mask in what it covers with its gaps joined."""
     x, y, w, h = cv2.boundingRect(lit)
     scale = min(1.0, 64 / max(w, h))
@@ -200,7 +200,7 @@ def lit_share(lit: NDArray[np.uint8]) -> float:
     return float(share.mean()) / float(joined.mean())
 
 
-def bridge_gaps(lit: NDArray[np.uint8], side_px: int) -> tuple[tuple[slice, slice], list[NDArray[np.bool_]]]:
+def bridge_gaps(lit: UInt8, side_px: int) -> tuple[tuple[slice, slice], list[Bool]]:
     """What a body of which only scattered parts are lit may look like: gaps of growing width bridged.
 
     Args:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import UInt8
 from hat_ros.config import HatConfig
 from hat_ros.errors import FrameError
 from hat_ros.stages import create_backend
@@ -65,7 +65,7 @@ class SegmentationStage:
         self._backend.reset()
 
 
-def is_black(rgb: NDArray[np.uint8]) -> bool:
+def is_black(rgb: UInt8) -> bool:
     """Whether an (H, W, 3) uint8 image shows nothing at all (or has no contrast because it is all white)."""
     low, high, _, _ = cv2.minMaxLoc(rgb.reshape(rgb.shape[0], -1))
     return high < _BLACK_LEVEL or low == high

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import UInt8
 from hat_ros.config import ClassicalConfig
 from hat_ros.geometry.masks import overlap
 from hat_ros.segmentation import region
@@ -61,7 +61,7 @@ class TexturedBackground:
 
     def find(
         self,
-        rgb: NDArray[np.uint8],
+        rgb: UInt8,
         masks: tuple[Mask | None, Mask | None],
         silhouette: Mask | None,
         trusted: bool,
@@ -112,7 +112,7 @@ class TexturedBackground:
         return found.mask
 
     def _track(
-        self, rgb: NDArray[np.uint8], mask: Mask, shift_xy: tuple[int, int], silhouette: Mask | None, trusted: bool
+        self, rgb: UInt8, mask: Mask, shift_xy: tuple[int, int], silhouette: Mask | None, trusted: bool
     ) -> tuple[Mask | None, bool]:
         """Follow the previous mask into this frame; the predicted silhouette helps while the two agree.
 
@@ -219,7 +219,7 @@ class TexturedBackground:
         gain = self._bank.overlap(other.mask.astype(bool)) - self._bank.overlap(than.mask.astype(bool))
         return other.contrast >= than.contrast and gain >= OPEN_BETTER
 
-    def _look_around(self, rgb: NDArray[np.uint8], tracked: Mask) -> Mask:
+    def _look_around(self, rgb: UInt8, tracked: Mask) -> Mask:
         """A mask that the ground vouches for, unless more of the target stands before the ground beyond it."""
         self._since_check = 0
         found = self._search.before_ground(rgb)
@@ -229,7 +229,7 @@ class TexturedBackground:
         self._check_every = min(2 * self._check_every, self._config.check_interval_frames)
         return tracked
 
-    def _cross_check(self, rgb: NDArray[np.uint8], tracked: Mask, aided: bool, silhouette: Mask | None) -> Mask | None:
+    def _cross_check(self, rgb: UInt8, tracked: Mask, aided: bool, silhouette: Mask | None) -> Mask | None:
         """Compare a tracked mask with what a search from nothing finds; keep the more plausible one.
 
         A mask held in place by a prediction is given up only for one that means something else; while a glance finds

@@ -9,7 +9,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+
+from hat_ros.array_types import Bool, Float, Float32
 
 # Columns of a contour table.
 CONTOUR_COLUMNS = 10
@@ -20,9 +21,7 @@ MAX_FREE_PX = 24
 _SMOOTHING_PX = 1.2
 
 
-def contour_table(
-    depth_m: NDArray[np.float32], silhouette: NDArray[np.bool_], K_crop: NDArray[np.float64], max_points: int
-) -> NDArray[np.float64]:
+def contour_table(depth_m: Float32, silhouette: Bool, K_crop: Float, max_points: int) -> Float:
     """Points on the outline of a rendered crop.
 
     Args:
@@ -41,7 +40,7 @@ def contour_table(
 
 
 @njit(cache=True, nogil=True)
-def _count_cracks(silhouette: NDArray[np.bool_]) -> int:
+def _count_cracks(silhouette: Bool) -> int:
     h, w = silhouette.shape
     count = 0
     for y in range(1, h - 1):
@@ -55,7 +54,7 @@ def _count_cracks(silhouette: NDArray[np.bool_]) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _free_distance(silhouette: NDArray[np.bool_], u: float, v: float, du: float, dv: float, inside: bool) -> int:
+def _free_distance(silhouette: Bool, u: float, v: float, du: float, dv: float, inside: bool) -> int:
     """Steps of one pixel along (du, dv) that stay inside (or outside) the silhouette."""
     h, w = silhouette.shape
     for step in range(1, MAX_FREE_PX + 1):
@@ -70,12 +69,12 @@ def _free_distance(silhouette: NDArray[np.bool_], u: float, v: float, du: float,
 
 @njit(cache=True, nogil=True)
 def _contour_table(
-    depth_m: NDArray[np.float32],
-    silhouette: NDArray[np.bool_],
-    blurred: NDArray[np.float32],
-    K: NDArray[np.float64],
+    depth_m: Float32,
+    silhouette: Bool,
+    blurred: Float32,
+    K: Float,
     max_points: int,
-) -> NDArray[np.float64]:
+) -> Float:
     h, w = silhouette.shape
     total = _count_cracks(silhouette)
     stride = max(1, (total + max_points - 1) // max_points)

@@ -12,6 +12,7 @@ from embreex.mesh_construction import TriangleMesh
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from hat_ros.array_types import Bool, Float, Float32, Int32
 from hat_ros.target.model import Target
 from hat_ros.target.outline import cast_outlined
 from hat_ros.target.rendering import Rendering
@@ -26,9 +27,7 @@ class RayCaster:
         self._scene = rtcore_scene.EmbreeScene()
         TriangleMesh(self._scene, corners)
 
-    def cast(
-        self, origins_m: NDArray[np.floating], directions: NDArray[np.floating]
-    ) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]:
+    def cast(self, origins_m: NDArray[np.floating], directions: NDArray[np.floating]) -> tuple[Int32, Float32, Float32]:
         """Nearest hits: (N, 3), (N, 3) -> face (N,) or -1, ray parameter (N,), barycentric weights (N, 3)."""
         hits = self.trace(origins_m, directions)
         u, v = hits["u"], hits["v"]
@@ -42,7 +41,7 @@ class RayCaster:
             output=True,
         )
 
-    def occluded(self, origins_m: NDArray[np.floating], directions: NDArray[np.floating]) -> NDArray[np.bool_]:
+    def occluded(self, origins_m: NDArray[np.floating], directions: NDArray[np.floating]) -> Bool:
         """Whether anything lies on each ray: (N, 3), (N, 3) -> (N,)."""
         hits = self._scene.run(
             np.ascontiguousarray(origins_m, dtype=np.float32),
@@ -67,7 +66,7 @@ class EmbreeRenderer:
         except QhullError:  # a flat model
             self._hull_m = target.vertices_m
 
-    def render(self, T_cam_target: NDArray[np.float64], camera: Camera, color: bool = True) -> Rendering:
+    def render(self, T_cam_target: Float, camera: Camera, color: bool = True) -> Rendering:
         """See :meth:`hat_ros.target.rendering.Renderer.render`."""
         shape = (camera.height, camera.width)
         depth = np.zeros(shape, np.float32)
@@ -97,7 +96,7 @@ class EmbreeRenderer:
             rgb.reshape(-1, 3)[at] = self._target.surface.sample(face, barycentric, self._target.face_rgb)
         return Rendering(depth, normal, face_id, rgb)
 
-    def silhouette(self, T_cam_target: NDArray[np.float64], camera: Camera) -> NDArray[np.bool_]:
+    def silhouette(self, T_cam_target: Float, camera: Camera) -> Bool:
         """The mask alone, (H, W); cheaper than :meth:`render`."""
         mask = np.zeros((camera.height, camera.width), np.bool_)
         x0, y0, x1, y1 = self.pixel_bounds(T_cam_target, camera)
@@ -106,7 +105,7 @@ class EmbreeRenderer:
             mask[y0:y1, x0:x1] = (hits["primID"] >= 0).reshape(y1 - y0, x1 - x0)
         return mask
 
-    def outlined(self, T_cam_target: NDArray[np.float64], camera: Camera) -> NDArray[np.bool_]:
+    def outlined(self, T_cam_target: Float, camera: Camera) -> Bool:
         """The mask like :meth:`silhouette` in half the time; specks may be lost."""
         mask = np.zeros((camera.height, camera.width), np.bool_)
         x0, y0, x1, y1 = self.pixel_bounds(T_cam_target, camera)
@@ -122,8 +121,8 @@ class EmbreeRenderer:
         return mask
 
     def _cast(
-        self, T_cam_target: NDArray[np.float64], camera: Camera, bounds: tuple[int, int, int, int]
-    ) -> tuple[NDArray[np.float32], dict[str, NDArray]]:
+        self, T_cam_target: Float, camera: Camera, bounds: tuple[int, int, int, int]
+    ) -> tuple[Float32, dict[str, NDArray]]:
         """Directions in the target frame (N, 3), and hits, of the rays through a half-open box of pixels, by rows."""
         R, t = T_cam_target[:3, :3], T_cam_target[:3, 3]
         x0, y0, x1, y1 = bounds
@@ -136,7 +135,7 @@ class EmbreeRenderer:
         origins[:] = -t @ R
         return directions, self.caster.trace(origins, directions)
 
-    def pixel_bounds(self, T_cam_target: NDArray[np.float64], camera: Camera) -> tuple[int, int, int, int]:
+    def pixel_bounds(self, T_cam_target: Float, camera: Camera) -> tuple[int, int, int, int]:
         """Half-open pixel range that can see the target: x0, y0, x1, y1."""
         points = self._hull_m @ T_cam_target[:3, :3].T + T_cam_target[:3, 3]
         if points[:, 2].max() <= 0:
@@ -150,7 +149,7 @@ class EmbreeRenderer:
         return int(low[0]), int(low[1]), int(high[0]), int(high[1])
 
 
-def pixel_rays(camera: Camera, u_px: NDArray[np.floating], v_px: NDArray[np.floating]) -> NDArray[np.float64]:
+def pixel_rays(camera: Camera, u_px: NDArray[np.floating], v_px: NDArray[np.floating]) -> Float:
     """Ray directions with z = 1 through a grid of image points: (U,), (V,) px -> (V, U, 3), camera frame."""
     y = (np.asarray(v_px, dtype=np.float64) - camera.K[1, 2]) / camera.K[1, 1]
     x = (np.asarray(u_px, dtype=np.float64)[None] - camera.K[0, 2] - camera.K[0, 1] * y[:, None]) / camera.K[0, 0]

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist
 
+from hat_ros.array_types import Bool, Float, Float32, Int, Int32, UInt8
 from hat_ros.errors import MeshError
 from hat_ros.target.mesh_file import read_scene, read_target_yaml
 
@@ -49,17 +50,15 @@ class Surface:
         metallic: (F,) float32, 0 dielectric to 1 metal.
     """
 
-    corner_uv: NDArray[np.float32]
-    corner_rgb: NDArray[np.uint8] | None
-    corner_normal: NDArray[np.float32]
+    corner_uv: Float32
+    corner_rgb: UInt8 | None
+    corner_normal: Float32
     texture_id: NDArray[np.int16]
-    textures: tuple[NDArray[np.uint8], ...]
-    roughness: NDArray[np.float32]
-    metallic: NDArray[np.float32]
+    textures: tuple[UInt8, ...]
+    roughness: Float32
+    metallic: Float32
 
-    def sample(
-        self, face_id: NDArray[np.int32], barycentric: NDArray[np.floating], face_rgb: NDArray[np.uint8]
-    ) -> NDArray[np.uint8]:
+    def sample(self, face_id: Int32, barycentric: NDArray[np.floating], face_rgb: UInt8) -> UInt8:
         """Albedo (N, 3) uint8 sRGB at points on faces: (N,) face, (N, 3) barycentric weights of its corners."""
         rgb = face_rgb[face_id]
         weights = np.asarray(barycentric, dtype=np.float32)
@@ -94,14 +93,14 @@ class Target:
     """
 
     name: str
-    vertices_m: NDArray[np.float64]
-    faces: NDArray[np.int32]
-    face_rgb: NDArray[np.uint8]
+    vertices_m: Float
+    faces: Int32
+    face_rgb: UInt8
     surface: Surface
     sha256: str
 
     @cached_property
-    def center_m(self) -> NDArray[np.float64]:
+    def center_m(self) -> Float:
         """(3,) centre of the axis-aligned box."""
         return 0.5 * (self.vertices_m.min(axis=0) + self.vertices_m.max(axis=0))
 
@@ -174,12 +173,12 @@ def target_from_scene(scene: trimesh.Scene, name: str, unit_scale: float = 1.0) 
 
 @dataclass(frozen=True)
 class _Part:
-    corners_m: NDArray[np.float64]  # (F, 3, 3)
-    corner_uv: NDArray[np.float32]  # (F, 3, 2)
-    corner_rgb: NDArray[np.uint8] | None  # (F, 3, 3)
-    corner_normal: NDArray[np.float32]  # (F, 3, 3)
-    rgb: NDArray[np.uint8]  # (F, 3)
-    texture: NDArray[np.uint8] | None
+    corners_m: Float  # (F, 3, 3)
+    corner_uv: Float32  # (F, 3, 2)
+    corner_rgb: UInt8 | None  # (F, 3, 3)
+    corner_normal: Float32  # (F, 3, 3)
+    rgb: UInt8  # (F, 3)
+    texture: UInt8 | None
     roughness: float
     metallic: float
 
@@ -213,9 +212,7 @@ def _part(scene: trimesh.Scene, node: str, name: str) -> _Part | None:
     return _Part(vertices[faces], corner_uv, corner_rgb, normal, rgb, texture, roughness, metallic)
 
 
-def _corner_normals(
-    mesh: trimesh.Trimesh, corners: NDArray[np.float64], faces: NDArray[np.int64], linear: NDArray[np.float64]
-) -> NDArray[np.float32]:
+def _corner_normals(mesh: trimesh.Trimesh, corners: Float, faces: Int, linear: Float) -> Float32:
     """Unit (F, 3, 3) normals: the file's, or the faces' own where it brings none."""
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, None].repeat(3, axis=1)
     normal = flat
@@ -228,7 +225,7 @@ def _corner_normals(
     return (normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-300)).astype(np.float32)
 
 
-def _material(material: Any) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None, float, float]:
+def _material(material: Any) -> tuple[UInt8, UInt8 | None, float, float]:
     """Colour (3,) sRGB, texture or None, roughness and metallic of a trimesh material."""
     is_pbr = isinstance(material, trimesh.visual.material.PBRMaterial)
     if is_pbr:
@@ -258,9 +255,9 @@ def _material(material: Any) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | Non
     return color, texture, roughness, metallic
 
 
-def _surface(parts: list[_Part], keep: NDArray[np.bool_]) -> tuple[Surface, NDArray[np.uint8]]:
+def _surface(parts: list[_Part], keep: Bool) -> tuple[Surface, UInt8]:
     counts = [len(part.rgb) for part in parts]
-    textures: list[NDArray[np.uint8]] = []
+    textures: list[UInt8] = []
     texture_id = []
     for part, count in zip(parts, counts, strict=True):
         index = -1
@@ -291,23 +288,23 @@ def _surface(parts: list[_Part], keep: NDArray[np.bool_]) -> tuple[Surface, NDAr
     return surface, np.rint(mean / len(_FACE_SAMPLES)).astype(np.uint8)
 
 
-def linear_from_srgb(rgb: NDArray[np.uint8]) -> NDArray[np.float64]:
+def linear_from_srgb(rgb: UInt8) -> Float:
     """Linear light 0..1 of 8-bit sRGB values (IEC 61966-2-1)."""
     c = np.asarray(rgb, dtype=np.float64) / 255.0
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
 
 
-def srgb_from_linear(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
+def srgb_from_linear(linear: NDArray[np.floating]) -> UInt8:
     """8-bit sRGB values of linear light, clipped to 0..1 (IEC 61966-2-1)."""
     c = np.clip(np.asarray(linear, dtype=np.float64), 0.0, 1.0)
     return np.rint(255.0 * np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)).astype(np.uint8)
 
 
-def _face_areas(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+def _face_areas(corners: Float) -> Float:
     return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
 
 
-def _check_extent(corners: NDArray[np.float64], name: str, unit_scale: float) -> None:
+def _check_extent(corners: Float, name: str, unit_scale: float) -> None:
     if not np.isfinite(corners).all():
         raise MeshError(f"CAD model {name}: some vertex coordinates are not finite numbers; repair the file")
     extent = float(np.ptp(corners.reshape(-1, 3), axis=0).max())

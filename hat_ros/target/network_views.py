@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from hat_ros.array_types import Float, Float32, Int, Int32, UInt8
 from hat_ros.target.model import Target
 from hat_ros.target.raster import edge_functions, nearest_faces
 
@@ -37,18 +38,16 @@ class NetworkViewRenderer:
         self._look = _look_of(target)
         self._pool = ThreadPoolExecutor(n_threads, "render")
 
-    def render(self, T_cam_target: NDArray[np.float64], K: NDArray[np.float64], size: tuple[int, int]) -> NDArray:
+    def render(self, T_cam_target: Float, K: Float, size: tuple[int, int]) -> NDArray:
         """One view: (4, 4), (3, 3) with pixel centres at +0.5, (width, height) -> (H, W, 6) uint8 RGB + normals."""
         return self._view(T_cam_target, K, size)
 
-    def render_many(
-        self, T_cam_target: NDArray[np.float64], K: NDArray[np.float64], size: tuple[int, int]
-    ) -> NDArray[np.uint8]:
+    def render_many(self, T_cam_target: Float, K: Float, size: tuple[int, int]) -> UInt8:
         """Views of (N, 4, 4) poses by (N, 3, 3) cameras of one size: (N, H, W, 6), see :meth:`render`."""
         views = list(self._pool.map(self._view, T_cam_target, K, [size] * len(K)))
         return np.stack(views) if views else np.zeros((0, size[1], size[0], 6), np.uint8)
 
-    def _view(self, T_cam_target: NDArray[np.float64], K: NDArray[np.float64], size: tuple[int, int]) -> NDArray:
+    def _view(self, T_cam_target: Float, K: Float, size: tuple[int, int]) -> NDArray:
         width, height = size
         T, K = np.asarray(T_cam_target, dtype=np.float64), np.ascontiguousarray(K, dtype=np.float64)
         R = np.ascontiguousarray(T[:3, :3])
@@ -67,13 +66,13 @@ class _Look(NamedTuple):
         texels: (T, 3) uint8 of all textures, row by row. texture_shape: (n, 3) first texel, height, width.
     """
 
-    face_rgb: NDArray[np.uint8]
-    corner_rgb: NDArray[np.uint8]
-    corner_normal: NDArray[np.float32]
-    corner_uv: NDArray[np.float32]
+    face_rgb: UInt8
+    corner_rgb: UInt8
+    corner_normal: Float32
+    corner_uv: Float32
     texture_id: NDArray[np.int16]
-    texels: NDArray[np.uint8]
-    texture_shape: NDArray[np.int64]
+    texels: UInt8
+    texture_shape: Int
 
 
 def _look_of(target: Target) -> _Look:
@@ -110,12 +109,12 @@ def encode_normal(component: float) -> float:
 
 @njit(cache=True, nogil=True)
 def _shade(
-    face: NDArray[np.int32],
-    edges: NDArray[np.float64],
-    samples: NDArray[np.float64],
-    R_cam_target: NDArray[np.float64],
+    face: Int32,
+    edges: Float,
+    samples: Float,
+    R_cam_target: Float,
     look: _Look,
-) -> NDArray[np.uint8]:
+) -> UInt8:
     """Mean colour and coded normal of each pixel's samples, black where they miss: (H, W, 6) uint8."""
     height, width, n_samples = face.shape
     out = np.zeros((height, width, 6), np.uint8)
@@ -146,7 +145,7 @@ def _shade(
 
 
 @njit(cache=True, nogil=True)
-def _albedo(f: int, weights: NDArray[np.float64], look: _Look, value: NDArray[np.float64]) -> None:
+def _albedo(f: int, weights: Float, look: _Look, value: Float) -> None:
     """Colour of a point on a face into ``value[:3]``, as ``Surface.sample`` gives it."""
     texture = look.texture_id[f]
     if texture >= 0:
@@ -170,10 +169,10 @@ def _albedo(f: int, weights: NDArray[np.float64], look: _Look, value: NDArray[np
 @njit(cache=True, nogil=True)
 def _coded_normal(
     f: int,
-    weights: NDArray[np.float64],
-    R_cam_target: NDArray[np.float64],
-    corner_normal: NDArray[np.float32],
-    value: NDArray[np.float64],
+    weights: Float,
+    R_cam_target: Float,
+    corner_normal: Float32,
+    value: Float,
 ) -> None:
     """Coded shading normal of a point on a face into ``value[3:]``: x right, z forward, y up."""
     n = corner_normal[f]

@@ -9,7 +9,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Rays = tuple[NDArray[np.float32], NDArray[np.float32]]
+from hat_ros.array_types import Bool, Float, Float32, Int32
+
+Rays = tuple[Float32, Float32]
 Hits = dict[str, NDArray]
 
 
@@ -24,17 +26,15 @@ class Outlined(NamedTuple):
         scattered: the rays through these, and their hits.
     """
 
-    mask: NDArray[np.bool_]
-    depth_m: NDArray[np.float32]
+    mask: Bool
+    depth_m: Float32
     grid: tuple[Rays, Hits]
-    x: NDArray[np.int32]
-    y: NDArray[np.int32]
+    x: Int32
+    y: Int32
     scattered: tuple[Rays, Hits]
 
 
-def cast_outlined(
-    trace: Callable[..., Hits], width: int, height: int, to_ray: NDArray[np.float64], origin: NDArray[np.float64]
-) -> Outlined:
+def cast_outlined(trace: Callable[..., Hits], width: int, height: int, to_ray: Float, origin: Float) -> Outlined:
     """Silhouette on a crop of even size with a third of the rays; a speck between the grid's rays is lost.
 
     Args:
@@ -52,7 +52,7 @@ def cast_outlined(
 
 
 @njit(cache=True, nogil=True)
-def grid_rays(width: int, height: int, to_ray: NDArray[np.float64], origin: NDArray[np.float64]) -> Rays:
+def grid_rays(width: int, height: int, to_ray: Float, origin: Float) -> Rays:
     """Origins and directions (N, 3) of the rays through every second pixel of a crop of even size, row by row.
 
     Args:
@@ -73,7 +73,7 @@ def grid_rays(width: int, height: int, to_ray: NDArray[np.float64], origin: NDAr
 
 
 @njit(cache=True, nogil=True)
-def scattered_rays(x: NDArray[np.int32], y: NDArray[np.int32], to_ray: NDArray, origin: NDArray) -> Rays:
+def scattered_rays(x: Int32, y: Int32, to_ray: NDArray, origin: NDArray) -> Rays:
     """The same through given pixels (N,), (N,)."""
     origins, directions = np.empty((len(x), 3), np.float32), np.empty((len(x), 3), np.float32)
     for i in range(len(x)):
@@ -84,9 +84,7 @@ def scattered_rays(x: NDArray[np.int32], y: NDArray[np.int32], to_ray: NDArray, 
 
 
 @njit(cache=True, nogil=True)
-def spread_grid(
-    face: NDArray[np.int32], distance: NDArray[np.float32], width: int, height: int
-) -> tuple[NDArray[np.bool_], NDArray[np.float32], NDArray[np.int32], NDArray[np.int32]]:
+def spread_grid(face: Int32, distance: Float32, width: int, height: int) -> tuple[Bool, Float32, Int32, Int32]:
     """What the grid's rays hit, on the whole crop, and which pixels remain to be asked.
 
     Args:
@@ -124,12 +122,12 @@ def spread_grid(
 
 @njit(cache=True, nogil=True)
 def place_pixels(
-    mask: NDArray[np.bool_],
-    depth: NDArray[np.float32],
-    x: NDArray[np.int32],
-    y: NDArray[np.int32],
-    face: NDArray[np.int32],
-    distance: NDArray[np.float32],
+    mask: Bool,
+    depth: Float32,
+    x: Int32,
+    y: Int32,
+    face: Int32,
+    distance: Float32,
 ) -> None:
     """Write what the rays through single pixels hit."""
     for i in range(len(x)):

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from PIL import Image
 
+from hat_ros.array_types import Float
 from hat_ros.errors import MissingDependencyError
 from hat_ros.target.embree import EmbreeRenderer
 from hat_ros.target.model import Target
@@ -42,7 +42,7 @@ class PyrenderRenderer:
         self._camera_node: Any = None
         self._canvas: Any = None
 
-    def render(self, T_cam_target: NDArray[np.float64], camera: Camera, color: bool = True) -> Rendering:
+    def render(self, T_cam_target: Float, camera: Camera, color: bool = True) -> Rendering:
         """See :meth:`hat_ros.target.rendering.Renderer.render`."""
         traced = self._rays.render(T_cam_target, camera, color=False)
         self._point(T_cam_target, camera)
@@ -61,7 +61,7 @@ class PyrenderRenderer:
             self._canvas.delete()
             self._canvas = None
 
-    def _point(self, T_cam_target: NDArray[np.float64], camera: Camera) -> None:
+    def _point(self, T_cam_target: Float, camera: Camera) -> None:
         gl, K = self._gl, camera.K
         distance = float(np.linalg.norm(T_cam_target[:3, :3] @ self._target.center_m + T_cam_target[:3, 3]))
         near = max(distance - 1.1 * self._target.bounding_radius_m, 1e-3 * distance, 1e-6)

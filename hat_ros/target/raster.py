@@ -12,14 +12,15 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+
+from hat_ros.array_types import Float, Int32
 
 # Corners nearer than this share of the farthest one do not bound their triangle's image: it may cover anything.
 _NEAR = 1e-4
 
 
 @njit(cache=True, nogil=True)
-def edge_functions(corners: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
+def edge_functions(corners: Float, rays: Float) -> Float:
     """Coefficients of ``b0, b1, b2`` over ``(u, v, 1)``: (F, 3, 3) corners in the camera frame, K^-1 -> (F, 3, 3).
 
     A triangle seen edge on gets NaN.
@@ -41,13 +42,13 @@ def edge_functions(corners: NDArray[np.float64], rays: NDArray[np.float64]) -> N
 
 @njit(cache=True, nogil=True)
 def nearest_faces(
-    corners: NDArray[np.float64],
-    K: NDArray[np.float64],
-    edges: NDArray[np.float64],
-    samples: NDArray[np.float64],
+    corners: Float,
+    K: Float,
+    edges: Float,
+    samples: Float,
     width: int,
     height: int,
-) -> NDArray[np.int32]:
+) -> Int32:
     """The face that each sample sees: (height, width, S) int32, -1 = none.
 
     Args:
@@ -86,7 +87,7 @@ def nearest_faces(
 
 
 @njit(cache=True, nogil=True)
-def _pixels(corners: NDArray[np.float64], K: NDArray[np.float64], width: int, height: int) -> tuple[int, int, int, int]:
+def _pixels(corners: Float, K: Float, width: int, height: int) -> tuple[int, int, int, int]:
     """Half-open columns and rows of the pixels that a triangle can reach: x0, y0, x1, y1."""
     far = max(corners[0, 2], corners[1, 2], corners[2, 2])
     near = min(corners[0, 2], corners[1, 2], corners[2, 2])

@@ -10,9 +10,7 @@ from functools import cached_property
 from importlib import import_module
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from hat_ros.array_types import Bool, Float, Float32, Int32, UInt8
 from hat_ros.errors import ConfigError
 from hat_ros.target.model import Target
 from hat_ros.types import Camera
@@ -29,13 +27,13 @@ class Rendering:
         rgb: (H, W, 3) uint8 sRGB albedo without any shading, 0 = miss.
     """
 
-    depth_m: NDArray[np.float32]
-    normal_cam: NDArray[np.float32]
-    face_id: NDArray[np.int32]
-    rgb: NDArray[np.uint8]
+    depth_m: Float32
+    normal_cam: Float32
+    face_id: Int32
+    rgb: UInt8
 
     @cached_property
-    def mask(self) -> NDArray[np.bool_]:
+    def mask(self) -> Bool:
         """(H, W) silhouette."""
         return self.face_id >= 0
 
@@ -43,7 +41,7 @@ class Rendering:
 class Renderer(Protocol):
     """A renderer of one target. Constructed as ``Backend(target: Target)``."""
 
-    def render(self, T_cam_target: NDArray[np.float64], camera: Camera, color: bool = True) -> Rendering:
+    def render(self, T_cam_target: Float, camera: Camera, color: bool = True) -> Rendering:
         """Render the target.
 
         Args:

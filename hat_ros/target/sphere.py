@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from hat_ros.array_types import Float
 
 _POLE_TOLERANCE = 1e-3
 
 
-def icosphere(n_subdivisions: int) -> NDArray[np.float64]:
+def icosphere(n_subdivisions: int) -> Float:
     """Unit vectors (10 * 4**n + 2, 3) of an icosahedron with poles on the z axis, each edge halved n times.
 
     Sorted by elevation, then by atan2(x, y).
@@ -29,7 +30,7 @@ def icosphere(n_subdivisions: int) -> NDArray[np.float64]:
     return vertices[np.lexsort((np.arctan2(vertices[:, 0], vertices[:, 1]), elevation))]
 
 
-def look_at_origin(position: NDArray[np.float64]) -> NDArray[np.float64]:
+def look_at_origin(position: Float) -> Float:
     """Rotations ``R_cam_target`` of cameras at ``position`` that look at the origin, image x horizontal: (N, 3, 3)."""
     forward = -position / np.linalg.norm(position, axis=1, keepdims=True)
     helper = np.broadcast_to([0.0, 0.0, -1.0], forward.shape).copy()

@@ -11,6 +11,7 @@ from itertools import permutations, product
 import numpy as np
 from numpy.typing import NDArray
 
+from hat_ros.array_types import Float, UInt8
 from hat_ros.cache import cached_arrays
 from hat_ros.geometry import lie
 from hat_ros.geometry.masks import overlap
@@ -30,13 +31,13 @@ _MAX_TURNS = 3
 _SEPARATION_DEG = 15.0
 
 
-def load_or_find_symmetries(target: Target) -> NDArray[np.float64]:
+def load_or_find_symmetries(target: Target) -> Float:
     """:func:`near_symmetries` from the cache folder, found and stored there when it is absent or damaged."""
     key = f"{target.sha256}:{_FORMAT}:{_SIDE_PX}:{_DISTANCE_RADII}:{_N_VIEWS}:{_MIN_OVERLAP}:{_MAX_TURNS}"
     return cached_arrays("near-symmetries", key, lambda: {"turns": near_symmetries(target)})["turns"]
 
 
-def near_symmetries(target: Target) -> NDArray[np.float64]:
+def near_symmetries(target: Target) -> Float:
     """(S, 3, 3) rotations of the target about its centre, those that change its silhouettes least first.
 
     Quarter, third and half turns about the axes of the file and about the principal axes of the surface.
@@ -47,7 +48,7 @@ def near_symmetries(target: Target) -> NDArray[np.float64]:
     camera = Camera(np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]]), _SIDE_PX, _SIDE_PX)
     position = np.array([0.0, 0.0, _DISTANCE_RADII * target.bounding_radius_m])
 
-    def silhouettes(turn: NDArray[np.float64]) -> list[NDArray[np.uint8]]:
+    def silhouettes(turn: Float) -> list[UInt8]:
         poses = (lie.transform(R @ turn, position - R @ turn @ target.center_m) for R in view_rotations(_N_VIEWS))
         return [renderer.outlined(T, camera).view(np.uint8) for T in poses]
 
@@ -58,13 +59,13 @@ def near_symmetries(target: Target) -> NDArray[np.float64]:
     return turns[order[alike[order] >= _MIN_OVERLAP][:_MAX_TURNS]]
 
 
-def turned(T_cam_target: NDArray[np.float64], turn: NDArray[np.float64], center_m: NDArray[np.float64]) -> NDArray:
+def turned(T_cam_target: Float, turn: Float, center_m: Float) -> NDArray:
     """A pose (4, 4) with the target turned (3, 3) about a point of its own (3,)."""
     R = T_cam_target[:3, :3]
     return lie.transform(R @ turn, T_cam_target[:3, 3] + R @ (center_m - turn @ center_m))
 
 
-def _turns(target: Target) -> NDArray[np.float64]:
+def _turns(target: Target) -> Float:
     """(N, 3, 3) the turns of a cube, but for none, about both sets of axes."""
     corners = target.vertices_m[target.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)

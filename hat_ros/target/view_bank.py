@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float, Float32
 from hat_ros.cache import cached_arrays
 from hat_ros.target.contour import COL_WEIGHT, contour_table
 from hat_ros.target.model import Target
@@ -54,14 +55,14 @@ class ViewBank:
         distance_m: () distance of the virtual camera from the centre.
     """
 
-    R_cam_target: NDArray[np.float64]
+    R_cam_target: Float
     spectrum: NDArray[np.complex64]
-    area: NDArray[np.float32]
-    gyration: NDArray[np.float64]
-    centroid: NDArray[np.float64]
-    contour_m: NDArray[np.float64]
-    contour_weight: NDArray[np.float64]
-    distance_m: NDArray[np.float64]
+    area: Float32
+    gyration: Float
+    centroid: Float
+    contour_m: Float
+    contour_weight: Float
+    distance_m: Float
 
     @property
     def n_angles(self) -> int:
@@ -114,7 +115,7 @@ def build(target: Target, renderer: Renderer, n_views: int, n_angles: int, thin_
     return ViewBank(rotations, spectrum, area, gyration, centroid, contour, weight, np.array(distance))
 
 
-def without_thin_parts(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def without_thin_parts(mask: Bool) -> Bool:
     """A silhouette (H, W) with at least one pixel, its booms and antennas left out."""
     silhouette = np.ascontiguousarray(mask).view(np.uint8)
     x, y, width, height = cv2.boundingRect(silhouette)
@@ -128,7 +129,7 @@ def without_thin_parts(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return body if np.count_nonzero(body) >= (1.0 - _THIN_BODY_SHARE) * np.count_nonzero(mask) else mask
 
 
-def mask_moments(mask: NDArray[np.bool_]) -> tuple[NDArray[np.float64], float]:
+def mask_moments(mask: Bool) -> tuple[Float, float]:
     """Centroid (2,) and radius of gyration of a mask with at least one pixel, pixels."""
     rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     x0, y0 = int(cols[0]), int(rows[0])
@@ -139,16 +140,14 @@ def mask_moments(mask: NDArray[np.bool_]) -> tuple[NDArray[np.float64], float]:
     return np.array([m["m10"] / area + x0, m["m01"] / area + y0]), float(np.sqrt(spread))
 
 
-def image_moments(image: NDArray[np.float32]) -> tuple[NDArray[np.float64], float]:
+def image_moments(image: Float32) -> tuple[Float, float]:
     """Centroid (2,) and radius of gyration of the light in an image that is not black, pixels."""
     m = cv2.moments(image)
     spread = (m["mu20"] + m["mu02"]) / m["m00"] + 1.0 / 6.0
     return np.array([m["m10"], m["m01"]]) / m["m00"], float(np.sqrt(spread))
 
 
-def polar_grid(
-    image: NDArray[np.float32], center_px: NDArray[np.float64], gyration_px: float, n_angles: int
-) -> NDArray[np.float32]:
+def polar_grid(image: Float32, center_px: Float, gyration_px: float, n_angles: int) -> Float32:
     """Sample an image, black beyond its border, on rings about a centre: (n_angles, rings), weighted.
 
     Each sample carries the square root of its area, so that the inner product of two grids is an area of overlap and
@@ -164,12 +163,12 @@ class PolarSampler:
         image: (H, W) float32; only the part that is not black is looked at.
     """
 
-    def __init__(self, image: NDArray[np.float32]) -> None:
+    def __init__(self, image: Float32) -> None:
         self._image = image
         self._left, self._top, self._width, self._height = cv2.boundingRect((image != 0).view(np.uint8))
-        self._averaged: dict[int, tuple[NDArray[np.float32], int, int]] = {}
+        self._averaged: dict[int, tuple[Float32, int, int]] = {}
 
-    def grid(self, center_px: NDArray[np.float64], gyration_px: float, n_angles: int) -> NDArray[np.float32]:
+    def grid(self, center_px: Float, gyration_px: float, n_angles: int) -> Float32:
         """(n_angles, rings) about a centre, pixels."""
         radius, angle = _polar(gyration_px, n_angles)
         image, left, top = self._average(int(gyration_px * MAX_RADIUS / N_RINGS))
@@ -177,7 +176,7 @@ class PolarSampler:
         y = (center_px[1] - top + radius * np.sin(angle)).astype(np.float32)
         return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT) * ring_weights()
 
-    def _average(self, step_px: int) -> tuple[NDArray[np.float32], int, int]:
+    def _average(self, step_px: int) -> tuple[Float32, int, int]:
         """What lies between two samples averaged: the part of the image that is not black then, and its corner."""
         if step_px not in self._averaged:
             left, top = max(self._left - step_px, 0), max(self._top - step_px, 0)
@@ -188,9 +187,7 @@ class PolarSampler:
         return self._averaged[step_px]
 
 
-def border_grid(
-    shape: tuple[int, ...], center_px: NDArray[np.float64], gyration_px: float, n_angles: int
-) -> NDArray[np.float32]:
+def border_grid(shape: tuple[int, ...], center_px: Float, gyration_px: float, n_angles: int) -> Float32:
     """The :func:`polar_grid` of an image (H, W) of ones: what of the grid lies inside the image."""
     radius, angle = _polar(gyration_px, n_angles)
     inside = np.ones((n_angles, N_RINGS))
@@ -200,18 +197,18 @@ def border_grid(
     return inside.astype(np.float32) * ring_weights()
 
 
-def _polar(gyration_px: float, n_angles: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _polar(gyration_px: float, n_angles: int) -> tuple[Float, Float]:
     """Radii (rings,) of a polar grid, pixels, and its angles (n_angles, 1), radians."""
     radius_px = (np.arange(N_RINGS) + 0.5) * (gyration_px * MAX_RADIUS / N_RINGS)
     return radius_px, (np.arange(n_angles) * (2.0 * np.pi / n_angles))[:, None]
 
 
-def ring_weights() -> NDArray[np.float32]:
+def ring_weights() -> Float32:
     """(rings,) square root of the area of a sample on each ring, up to a common factor."""
     return np.sqrt((np.arange(N_RINGS) + 0.5) * (MAX_RADIUS / N_RINGS)).astype(np.float32)
 
 
-def view_rotations(n_views: int) -> NDArray[np.float64]:
+def view_rotations(n_views: int) -> Float:
     """(n_views, 3, 3) ``R_cam_target`` looking at the target from the vertices of a subdivided icosahedron."""
     directions = _icosphere(n_views)  # from the target to the camera
     z = -directions
@@ -221,7 +218,7 @@ def view_rotations(n_views: int) -> NDArray[np.float64]:
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def _icosphere(n_vertices: int) -> NDArray[np.float64]:
+def _icosphere(n_vertices: int) -> Float:
     """Unit vertices of an icosahedron whose edges are halved until it has ``10 * 4^n + 2`` vertices."""
     g = (1.0 + np.sqrt(5.0)) / 2.0
     vertices = [(-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g)]

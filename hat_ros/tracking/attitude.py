@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hat_ros.array_types import Float
 from hat_ros.geometry import lie
-from hat_ros.types import Float
 
 # Measured frames between which turns are compared; with fewer than the second nothing is known.
 _HISTORY, _MIN_MEASURED = 14, 8

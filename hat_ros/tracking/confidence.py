@@ -6,8 +6,9 @@ from collections import deque
 
 import numpy as np
 
+from hat_ros.array_types import Float
 from hat_ros.config import RefinementConfig
-from hat_ros.types import Float, Selection
+from hat_ros.types import Selection
 
 # Keyframes in a row whose best appearance must lie in the output's basin: errors of a mask persist, but not so long.
 _KEYFRAMES = 2

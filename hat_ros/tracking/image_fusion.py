@@ -27,6 +27,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hat_ros.array_types import Float
 from hat_ros.config import HatConfig, RefinementConfig
 from hat_ros.core.alignment import SlamAlignment
 from hat_ros.core.cadence import Cadence
@@ -38,7 +39,7 @@ from hat_ros.tracking.confidence import BasinConfidence
 from hat_ros.tracking.prior import extrapolate
 from hat_ros.tracking.refiner import Refiner
 from hat_ros.tracking.uncertainty import KeyframeSpread, widened
-from hat_ros.types import Detection, Float, Frame, Motion, Refined, RotationPrior, Selection
+from hat_ros.types import Detection, Frame, Motion, Refined, RotationPrior, Selection
 
 # An anchor further from where the track expected it than this share of D shares its basin, but bears no witness to it.
 _CLOSE_SHARE = 0.5

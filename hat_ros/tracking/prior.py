@@ -11,9 +11,10 @@ from functools import cache
 
 import numpy as np
 
+from hat_ros.array_types import Float
 from hat_ros.config import PriorConfig
 from hat_ros.geometry import lie
-from hat_ros.types import Estimate, Float, PosePrior, TrackState
+from hat_ros.types import Estimate, PosePrior, TrackState
 
 # Past poses behind one extrapolation: enough for the medians, short enough for a constant rate.
 HISTORY_FRAMES = 8

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from hat_ros.types import Detection, Float, Frame, Refined, RotationPrior
+from hat_ros.array_types import Float
+from hat_ros.types import Detection, Frame, Refined, RotationPrior
 
 
 class Refiner(Protocol):

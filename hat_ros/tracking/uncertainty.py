@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from hat_ros.array_types import Float
 from hat_ros.geometry import lie
-from hat_ros.types import Float, Selection
+from hat_ros.types import Selection
 
 # Keyframes whose spread counts. So few tell a variance badly: Student's t with as many degrees of freedom reaches, at
 # 95 %, as far as a normal distribution of so many times the variance.

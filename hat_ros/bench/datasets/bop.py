@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Float
 from hat_ros.bench.datasets.image_files import ImageFile, ImageRecording, camera_from_label, image_size, stamp_of
 from hat_ros.bench.datasets.sequence import read_json
 from hat_ros.errors import DatasetError
@@ -133,7 +133,7 @@ def _objects(gt: Any, scene: Path) -> set[int]:
     return set(found)
 
 
-def _pose(entry: Any, where: str) -> NDArray[np.float64]:
+def _pose(entry: Any, where: str) -> Float:
     try:
         R = np.array(entry["cam_R_m2c"], dtype=np.float64).reshape(3, 3)
         t = np.array(entry["cam_t_m2c"], dtype=np.float64).reshape(3) * MILLIMETRE
@@ -145,7 +145,7 @@ def _pose(entry: Any, where: str) -> NDArray[np.float64]:
     return T
 
 
-def _K(calibration: Any, number: int, scene: Path) -> NDArray[np.float64]:
+def _K(calibration: Any, number: int, scene: Path) -> Float:
     try:
         return np.array(calibration[str(number)]["cam_K"], dtype=np.float64).reshape(9)
     except (KeyError, TypeError, ValueError):

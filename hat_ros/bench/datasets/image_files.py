@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Float, Float32, UInt8
 from hat_ros.errors import DatasetError, FrameError
 from hat_ros.geometry import lie
 from hat_ros.types import Camera, Frame
@@ -38,9 +38,9 @@ class ImageFile:
 
     stamp_ns: int
     image: Path
-    T_cam_target: NDArray[np.float64] | None = None
+    T_cam_target: Float | None = None
     masks: tuple[Path, ...] = ()
-    box_xyxy: NDArray[np.float64] | None = None
+    box_xyxy: Float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ class ImageRecording:
     camera: Camera
     target_path: Path
     files: Sequence[ImageFile]
-    distortion: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    distortion: Float = field(default_factory=lambda: np.zeros(0))
     unit_scale: float = 1.0
     detections: DetectionLookup | None = None
     scene: tuple[int, int] | None = None
@@ -85,7 +85,7 @@ class ImageRecording:
         rgb = self._rectify(read_rgb(item.image), item.image, cv2.INTER_LINEAR)
         return Frame(item.stamp_ns, rgb, self.camera, self.given_mask(item) if mask else None)
 
-    def given_mask(self, item: ImageFile) -> NDArray[np.uint8] | None:
+    def given_mask(self, item: ImageFile) -> UInt8 | None:
         """(H, W) uint8 as in ``Frame.given_mask``, None when the frame brings no detection at all."""
         if self.detections is not None:
             mask = self.detections.given_mask(item.image.name, (self.camera.height, self.camera.width))
@@ -103,16 +103,16 @@ class ImageRecording:
             return mask
         return None
 
-    def truth(self) -> dict[int, NDArray[np.float64]]:
+    def truth(self) -> dict[int, Float]:
         """Stamp -> (4, 4) ``T_cam_target`` of the labelled frames."""
         return {item.stamp_ns: item.T_cam_target for item in self.files if item.T_cam_target is not None}
 
     @cached_property
-    def _maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def _maps(self) -> tuple[Float32, Float32]:
         size = (self.camera.width, self.camera.height)
         return cv2.initUndistortRectifyMap(self.camera.K, self.distortion, None, self.camera.K, size, cv2.CV_32FC1)
 
-    def _rectify(self, image: NDArray[np.uint8], path: Path, interpolation: int) -> NDArray[np.uint8]:
+    def _rectify(self, image: UInt8, path: Path, interpolation: int) -> UInt8:
         if image.shape[:2] != (self.camera.height, self.camera.width):
             raise DatasetError(
                 f"{path}: image is {image.shape[1]}x{image.shape[0]}, "
@@ -123,7 +123,7 @@ class ImageRecording:
         return cv2.remap(image, *self._maps, interpolation)
 
 
-def read_rgb(path: Path) -> NDArray[np.uint8]:
+def read_rgb(path: Path) -> UInt8:
     """(H, W, 3) uint8 RGB of an image file; grey is repeated.
 
     Raises:
@@ -132,7 +132,7 @@ def read_rgb(path: Path) -> NDArray[np.uint8]:
     return cv2.cvtColor(_read(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
 
-def _read(path: Path, flags: int) -> NDArray[np.uint8]:
+def _read(path: Path, flags: int) -> UInt8:
     try:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError as error:
@@ -144,9 +144,7 @@ def _read(path: Path, flags: int) -> NDArray[np.uint8]:
     return image
 
 
-def pose_from_label(
-    quat: Sequence[float], translation_m: Sequence[float], order: str, where: str
-) -> NDArray[np.float64]:
+def pose_from_label(quat: Sequence[float], translation_m: Sequence[float], order: str, where: str) -> Float:
     """(4, 4) ``T_cam_target`` from a label with ``p_cam = R(q) p + t``.
 
     Args:

@@ -13,8 +13,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import UInt8
 from hat_ros.bench.datasets.image_files import ImageFile, ImageRecording
 from hat_ros.errors import DatasetError, UsageError
 from hat_ros.io.bag import BagWriter
@@ -194,7 +194,7 @@ def _write_bag(recording: ImageRecording, bag: Path, made_from: dict[str, Any], 
     partial.rmdir()
 
 
-def _image(recording: ImageRecording, item: ImageFile) -> bytes | NDArray[np.uint8]:
+def _image(recording: ImageRecording, item: ImageFile) -> bytes | UInt8:
     """The file's own bytes where nothing has to change, else undistorted pixels (stored without loss)."""
     frame = recording.frame(item)  # also proves that the file can be decoded and has the right size
     if recording.distortion.any() or item.image.suffix.lower() not in (".jpg", ".jpeg", ".png"):
@@ -258,7 +258,7 @@ def with_detections(recording: ImageRecording, path: Path) -> ImageRecording:
     return replace(recording, detections=lookup)
 
 
-def check_picture(recording: ImageRecording, width_px: int = 640, renderer_name: str = "embree") -> NDArray[np.uint8]:
+def check_picture(recording: ImageRecording, width_px: int = 640, renderer_name: str = "embree") -> UInt8:
     """First, middle and last labelled frame over the CAD rendered at the true pose, outlined in green: (H, W, 3) RGB.
 
     Wrong units, quaternion order, frames or axes show at once: the outline misses the target. A mirrored or turned

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Float
 from hat_ros.bench.datasets.image_files import ImageFile, ImageRecording, pose_from_label, stamp_of
 from hat_ros.errors import DatasetError, FrameError
 from hat_ros.geometry import lie
@@ -48,9 +48,7 @@ def load_sequence(folder: str | Path) -> ImageRecording:
     return ImageRecording(folder.name, camera, mesh, files, unit_scale=float(scale))
 
 
-def write_labels(
-    folder: Path, camera: Camera, mesh: str, kind: str, poses: NDArray[np.float64], names: list[str]
-) -> None:
+def write_labels(folder: Path, camera: Camera, mesh: str, kind: str, poses: Float, names: list[str]) -> None:
     """Write ``labels.json``: (N, 4, 4) ``T_cam_target`` poses of the named images."""
     frames = [
         {

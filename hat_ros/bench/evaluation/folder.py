@@ -8,9 +8,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from hat_ros.app.overlay import OverlayPainter, VideoFile
+from hat_ros.array_types import UInt8
 from hat_ros.bench.evaluation.figures import error_figure, image_bytes, range_figure
 from hat_ros.bench.evaluation.pose_tables import write_tables
 from hat_ros.bench.evaluation.report import write_report
@@ -121,13 +121,13 @@ def _source_of(run: dict[str, Any]) -> Source | None:
         return None
 
 
-def _report(folder: Path, log: RunLog, figures: dict[str, Any], strip: list[tuple[str, NDArray[np.uint8]]]) -> None:
+def _report(folder: Path, log: RunLog, figures: dict[str, Any], strip: list[tuple[str, UInt8]]) -> None:
     run, _, config_text = read_folder(folder)
     title = f"{Path(run['source']).name}: {run.get('mode', 'hat')}"
     write_report(folder / "report.html", title, log, figures, run, config_text, strip)
 
 
-def paint_overlay(folder: Path, source: Source, log: RunLog, video: bool) -> list[tuple[str, NDArray[np.uint8]]]:
+def paint_overlay(folder: Path, source: Source, log: RunLog, video: bool) -> list[tuple[str, UInt8]]:
     """Draw the run into its images: the video, and captioned frames for the report."""
     if not len(log):
         return []

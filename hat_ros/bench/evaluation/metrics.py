@@ -16,15 +16,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
+from hat_ros.array_types import Bool, Float, Int
 from hat_ros.geometry import lie
 from hat_ros.types import TrackState
-
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
 
 # A rotation further off than this lies in another orientation basin (paper: the share above 90 degrees).
 WRONG_BASIN_DEG = 90.0
@@ -240,7 +237,7 @@ def untrue_tracking_share(states: Sequence[int], errors: PoseErrors, limit_deg: 
     return _share(np.asarray(states)[far] == TrackState.TRACKING)
 
 
-def relative_motion_deg(pose_rows: Float, valid: Bool, epoch: NDArray[np.int64], T_true: Float) -> Float:
+def relative_motion_deg(pose_rows: Float, valid: Bool, epoch: Int, T_true: Float) -> Float:
     """Rotation error of the motion estimate from each frame to the next, eq. (increment).
 
     Args:

@@ -11,8 +11,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import UInt8
 from hat_ros.bench.evaluation import figures
 from hat_ros.io.run_log import RunLog
 
@@ -61,7 +61,7 @@ def write_report(
     metrics: dict[str, Any],
     run: dict[str, Any],
     config_text: str,
-    strip: Sequence[tuple[str, NDArray[np.uint8]]] = (),
+    strip: Sequence[tuple[str, UInt8]] = (),
 ) -> None:
     """Write the report of one run.
 
@@ -116,7 +116,7 @@ def _image(data: bytes, description: str, kind: str = "png") -> str:
     return f'<img alt="{html.escape(description)}" src="data:image/{kind};base64,{base64.b64encode(data).decode()}">'
 
 
-def _strip(frames: Sequence[tuple[str, NDArray[np.uint8]]]) -> str:
+def _strip(frames: Sequence[tuple[str, UInt8]]) -> str:
     cells = []
     for caption, rgb in frames:
         ok, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 82])

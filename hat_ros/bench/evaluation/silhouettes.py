@@ -7,8 +7,8 @@ from tempfile import TemporaryFile
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, UInt8
 from hat_ros.geometry.masks import overlap
 from hat_ros.tracker import Step
 
@@ -36,7 +36,7 @@ class Silhouettes:
             self._file.write(np.packbits(mask[_within(box)]).tobytes())
         self._places[step.estimate.stamp_ns] = place
 
-    def overlaps(self, recorded: Iterable[tuple[int, NDArray[np.uint8] | None]]) -> dict[int, float]:
+    def overlaps(self, recorded: Iterable[tuple[int, UInt8 | None]]) -> dict[int, float]:
         """Stamp -> intersection over union, 0 for a target that was missed; frames that show no silhouette left out.
 
         To be asked for after the last frame.
@@ -54,7 +54,7 @@ class Silhouettes:
                 out[stamp_ns] = 0.0 if place is None else overlap(self._detected(*place, given.shape), silhouette)
         return out
 
-    def _detected(self, start: int, box: Box, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    def _detected(self, start: int, box: Box, shape: tuple[int, ...]) -> Bool:
         _, _, width, height = box
         self._file.seek(start)
         packed = np.frombuffer(self._file.read(-(-width * height // 8)), np.uint8)

@@ -15,10 +15,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hat_ros.array_types import Float
 from hat_ros.config import SelectorConfig
 from hat_ros.core.selector import rotation_increment, scaled_score
 from hat_ros.geometry import lie
-from hat_ros.types import Candidates, Float, Motion, Selection
+from hat_ros.types import Candidates, Motion, Selection
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float
 from hat_ros.bench.methods.framewise import Hat
 from hat_ros.bench.methods.smoothing import smooth_measured, solve_offline
 from hat_ros.config import HatConfig
@@ -26,7 +26,7 @@ from hat_ros.stages import offline_motions_of
 from hat_ros.target.model import Target
 from hat_ros.tracker import StageWrapper, Step
 from hat_ros.tracking.image_fusion import is_supported, quality
-from hat_ros.types import Camera, Detection, Estimate, Float, Frame, Motion, Refined, TrackState
+from hat_ros.types import Camera, Detection, Estimate, Frame, Motion, Refined, TrackState
 
 # The paper's dense refinement rejects what lies further than this from the anchors.
 _SAME_BASIN_DEG = 90.0
@@ -92,7 +92,7 @@ class Offline:
             return causal
         return self._offline_motions(self._config, self._images)
 
-    def _best_known(self, T_decided: Float, tied: NDArray[np.bool_]) -> Float:
+    def _best_known(self, T_decided: Float, tied: Bool) -> Float:
         """Poses (N, 4, 4): the decided ones, and the causal ones where no motion ties the decided to other frames.
 
         There hindsight knows no more than the causal method did.

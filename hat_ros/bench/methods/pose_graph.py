@@ -18,9 +18,9 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from hat_ros.array_types import Float
 from hat_ros.config import FusionConfig
 from hat_ros.geometry import lie
-from hat_ros.types import Float
 
 _MAX_STEPS = 100
 _RELATIVE_TOLERANCE = 1e-12

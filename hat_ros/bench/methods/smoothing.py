@@ -12,15 +12,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float, Int
 from hat_ros.bench.methods.pose_graph import PoseGraph
 from hat_ros.config import HatConfig, SelectorConfig
 from hat_ros.core.alignment import SlamAlignment
 from hat_ros.core.published_fusion import AreaConfidence, relative_motion
 from hat_ros.core.selector import RunningGate, box_area_px, motion_penalty, scaled_score
 from hat_ros.geometry import lie
-from hat_ros.types import Candidates, Float, Motion
+from hat_ros.types import Candidates, Motion
 
 # Random rotations agree within 75 degrees one time in nine, so motion that fits nothing links a fifth of the anchors.
 _CREDIBLE_SHARE = 1.0 / 3.0
@@ -45,9 +45,9 @@ class OfflineResult:
     """
 
     T_cam_target: Float
-    chosen: NDArray[np.int64]
+    chosen: Int
     gate_weight: Float
-    tied: NDArray[np.bool_]
+    tied: Bool
 
 
 def solve_offline(candidates: Sequence[Candidates], motions: Sequence[Motion], config: HatConfig) -> OfflineResult:
@@ -133,7 +133,7 @@ def _difference(step: Float, T_before: Float, T_after: Float) -> Float:
     return np.stack([turn, predicted[:3, 3] - T_after[:3, 3]])
 
 
-def consistent(anchors: Sequence[Float], motions: Sequence[Motion], config: HatConfig) -> NDArray[np.bool_]:
+def consistent(anchors: Sequence[Float], motions: Sequence[Motion], config: HatConfig) -> Bool:
     """Which anchors of one SLAM epoch belong to the longest history that the motion can tell: (n,) flags.
 
     A history passes through anchors in order. Each one counts one; going on to an anchor whose rotation, propagated by
@@ -168,7 +168,7 @@ def consistent(anchors: Sequence[Float], motions: Sequence[Motion], config: HatC
     return kept if np.count_nonzero(kept) >= _CREDIBLE_SHARE * n else np.ones(n, dtype=bool)
 
 
-def backtrace(candidates: Sequence[Candidates], motions: Sequence[Motion], config: SelectorConfig) -> NDArray[np.int64]:
+def backtrace(candidates: Sequence[Candidates], motions: Sequence[Motion], config: SelectorConfig) -> Int:
     """The path of eq. (viterbi) through all keyframes: (N,) candidate index, -1 where there is none.
 
     With ``running_gate`` the path counts only if the median support over all keyframes and the share of keyframes

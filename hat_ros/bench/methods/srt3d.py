@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float, Int, UInt8
 from hat_ros.config import HatConfig
 from hat_ros.geometry import lie
 from hat_ros.hypotheses.stage import HypothesisStage
@@ -25,8 +26,6 @@ from hat_ros.target.contour import MAX_FREE_PX
 from hat_ros.target.model import Target
 from hat_ros.tracker import StageWrapper, Step
 from hat_ros.types import Camera, Candidates, Estimate, Frame, Motion, Selection, TrackState
-
-Float = NDArray[np.float64]
 
 SCALES = (5, 2, 2, 1, 1, 1, 1)
 N_LINES = 200
@@ -57,7 +56,7 @@ class ColorHistograms:
         self._foreground, self._background = np.zeros(shape), np.zeros(shape)
         self._started = False
 
-    def learn(self, foreground: NDArray[np.uint8], background: NDArray[np.uint8]) -> None:
+    def learn(self, foreground: UInt8, background: UInt8) -> None:
         """Blend in the colours of this frame: (N, 3), (M, 3) RGB; the first ones count fully."""
         rate = HISTOGRAM_RATE if self._started else 1.0
         for histogram, rgb in ((self._foreground, foreground), (self._background, background)):
@@ -67,7 +66,7 @@ class ColorHistograms:
                 histogram += rate * counts / len(rgb)
         self._started = True
 
-    def probabilities(self, rgb: NDArray[np.uint8]) -> tuple[Float, Float]:
+    def probabilities(self, rgb: UInt8) -> tuple[Float, Float]:
         """Foreground and background probability of each colour, summing to one; a half each where unseen."""
         index = _bins(rgb)
         foreground, background = self._foreground[index], self._background[index]
@@ -76,7 +75,7 @@ class ColorHistograms:
         return share, 1.0 - share
 
 
-def _bins(rgb: NDArray[np.uint8]) -> NDArray[np.int64]:
+def _bins(rgb: UInt8) -> Int:
     level = rgb.astype(np.int64) * HISTOGRAM_BINS // 256
     return (level[..., 0] * HISTOGRAM_BINS + level[..., 1]) * HISTOGRAM_BINS + level[..., 2]
 
@@ -181,7 +180,7 @@ class RegionTracker:
         self._histograms.learn(*colors)
 
 
-def _project(T: Float, contour: _Contour, camera: Camera) -> tuple[Float, Float, Float, NDArray[np.bool_]]:
+def _project(T: Float, contour: _Contour, camera: Camera) -> tuple[Float, Float, Float, Bool]:
     """Image position (N, 2), unit image normal (N, 2), pixels per metre (N,), and which points can be used."""
     points = contour.points_m @ T[:3, :3].T + T[:3, 3]
     normal = (contour.normals @ T[:3, :3].T)[:, :2]

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from hat_ros.array_types import Bool, Float, Float32
 from hat_ros.target.embree import pixel_rays
 from hat_ros.types import Camera
 
@@ -39,7 +39,7 @@ class Earth:
 class EarthView:
     """Renders the Earth for one camera and light."""
 
-    def __init__(self, earth: Earth, camera: Camera, to_sun_cam: NDArray[np.float64]) -> None:
+    def __init__(self, earth: Earth, camera: Camera, to_sun_cam: Float) -> None:
         self._earth = earth
         self._ground = _ground_map(np.random.default_rng([earth.seed, 1]))
         rays = pixel_rays(camera, np.arange(camera.width), np.arange(camera.height))
@@ -66,11 +66,11 @@ class EarthView:
         self._haze = _haze(rays, center, along, miss_sq, hit, normal, to_sun)
 
     @property
-    def covers(self) -> NDArray[np.bool_]:
+    def covers(self) -> Bool:
         """(H, W) pixels in front of which the Earth stands."""
         return self._hit
 
-    def radiance(self, time_s: float) -> NDArray[np.float32]:
+    def radiance(self, time_s: float) -> Float32:
         """(H, W, 3) linear light at a time after the start."""
         shift = np.radians(self._earth.speed_deg_s) * time_s * _MAP_SIDE / _MAP_SPAN_RAD
         x = np.mod(self._x + np.float32(shift), _MAP_SIDE)
@@ -95,7 +95,7 @@ class Table:
         self._height_m = height_m
         self._texels_per_m = _MAP_SIDE / tile_m
 
-    def radiance(self, T_cam_target: NDArray[np.float64], camera: Camera) -> NDArray[np.float32]:
+    def radiance(self, T_cam_target: Float, camera: Camera) -> Float32:
         """(H, W, 3) linear light, black above the horizon."""
         rays = pixel_rays(camera, np.arange(camera.width), np.arange(camera.height)) @ T_cam_target[:3, :3]
         eye = -T_cam_target[:3, 3] @ T_cam_target[:3, :3]
@@ -108,7 +108,7 @@ class Table:
         return top * hit[..., None]
 
 
-def stars(camera: Camera, seed: int, count: int) -> NDArray[np.float32]:
+def stars(camera: Camera, seed: int, count: int) -> Float32:
     """(H, W, 3) field of point stars, most of them faint."""
     rng = np.random.default_rng([seed, 2])
     sky = np.zeros((camera.height, camera.width, 3), np.float32)
@@ -118,14 +118,14 @@ def stars(camera: Camera, seed: int, count: int) -> NDArray[np.float32]:
 
 
 def _haze(
-    rays: NDArray[np.float64],
-    center: NDArray[np.float64],
-    along: NDArray[np.float64],
-    miss_sq: NDArray[np.float64],
-    hit: NDArray[np.bool_],
-    normal: NDArray[np.float64],
-    to_sun: NDArray[np.float64],
-) -> NDArray[np.float32]:
+    rays: Float,
+    center: Float,
+    along: Float,
+    miss_sq: Float,
+    hit: Bool,
+    normal: Float,
+    to_sun: Float,
+) -> Float32:
     """Blue scattering: a thin bright limb that fades over the atmosphere's height, and a veil over the disc's edge."""
     height = np.sqrt(np.maximum(miss_sq, 0)) - _EARTH_RADIUS_KM
     limb = np.where(hit, 0.0, np.exp(-np.maximum(height, 0) / (_ATMOSPHERE_KM / 4))) * (along > 0)
@@ -137,7 +137,7 @@ def _haze(
     return ((0.5 * limb + veil) * day)[..., None].astype(np.float32) * np.array([0.35, 0.6, 1.0], np.float32)
 
 
-def _ground_map(rng: np.random.Generator) -> NDArray[np.float32]:
+def _ground_map(rng: np.random.Generator) -> Float32:
     """(N, N, 3) repeating albedo: sea, land, clouds."""
     land, clouds, detail = (_fractal_noise(rng, slope) for slope in (2.2, 1.7, 1.2))
     green = np.clip((land - 0.52) * 20, 0, 1)[..., None]
@@ -147,7 +147,7 @@ def _ground_map(rng: np.random.Generator) -> NDArray[np.float32]:
     return (ground * (1 - cover) + 0.75 * cover).astype(np.float32)
 
 
-def _fractal_noise(rng: np.random.Generator, slope: float) -> NDArray[np.float64]:
+def _fractal_noise(rng: np.random.Generator, slope: float) -> Float:
     """Periodic noise in [0, 1] whose spectrum falls with frequency to the power -slope."""
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(_MAP_SIDE), np.fft.rfftfreq(_MAP_SIDE), indexing="ij"))
     frequency[0, 0] = np.inf

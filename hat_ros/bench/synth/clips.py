@@ -9,8 +9,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from hat_ros.array_types import Bool, Float, Float32, UInt8
 from hat_ros.bench.datasets.image_files import FRAME_STEP_NS
 from hat_ros.bench.datasets.sequence import write_labels
 from hat_ros.bench.synth.backdrop import Earth, EarthView, Table, stars
@@ -20,7 +20,6 @@ from hat_ros.geometry import lie
 from hat_ros.target.model import Target, srgb_from_linear
 from hat_ros.types import Camera
 
-Float = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 # Full well of the sensor in electrons at exposed white: sets the shot noise.
@@ -117,8 +116,8 @@ class SynthFrame:
         T_cam_target: (4, 4) truth.
     """
 
-    rgb: NDArray[np.uint8]
-    mask: NDArray[np.bool_]
+    rgb: UInt8
+    mask: Bool
     T_cam_target: Float
 
 
@@ -174,7 +173,7 @@ class _Backdrop:
         if spec.table:
             self._table = Table(float(target.vertices_m[:, 2].min()), 4 * target.diameter_m, spec.seed)
 
-    def radiance(self, index: int, T_cam_target: Float) -> NDArray[np.float32]:
+    def radiance(self, index: int, T_cam_target: Float) -> Float32:
         if self._table is not None:
             return self._table.radiance(T_cam_target, self._camera)
         if self._earth is not None:
@@ -182,7 +181,7 @@ class _Backdrop:
         return self._stars
 
 
-def _glare(spec: ClipSpec) -> NDArray[np.float32]:
+def _glare(spec: ClipSpec) -> Float32:
     """(H, W, 1) stray light before exposure."""
     x, y = np.arange(spec.width) - _GLARE_AT[0] * spec.width, np.arange(spec.height) - _GLARE_AT[1] * spec.height
     distance = np.hypot(x[None, :], y[:, None])
@@ -190,7 +189,7 @@ def _glare(spec: ClipSpec) -> NDArray[np.float32]:
     return glow[..., None].astype(np.float32)
 
 
-def _expose(radiance: NDArray[np.float32], spec: ClipSpec, index: int) -> NDArray[np.uint8]:
+def _expose(radiance: Float32, spec: ClipSpec, index: int) -> UInt8:
     """Optics and sensor: point spread, saturation, shot and read noise, sRGB encoding."""
     image = radiance * np.float32(spec.exposure)
     if spec.monochrome:

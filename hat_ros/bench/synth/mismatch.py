@@ -8,10 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from hat_ros.array_types import Bool, Float, Int32, UInt8
 from hat_ros.errors import UsageError
 from hat_ros.geometry import lie
 from hat_ros.target.model import Surface, Target, linear_from_srgb, srgb_from_linear
@@ -59,7 +59,7 @@ def apply_mismatch(target: Target, mismatch: Mismatch) -> Target:
     return target
 
 
-def _parts(target: Target) -> NDArray[np.int32]:
+def _parts(target: Target) -> Int32:
     """(F,) number of the connected part of each face."""
     a, b = target.faces.ravel(), np.roll(target.faces, 1, axis=1).ravel()
     n = len(target.vertices_m)
@@ -67,12 +67,12 @@ def _parts(target: Target) -> NDArray[np.int32]:
     return labels[target.faces[:, 0]]
 
 
-def _areas(target: Target) -> NDArray[np.float64]:
+def _areas(target: Target) -> Float:
     corners = target.vertices_m[target.faces]
     return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
 
 
-def _turn_panels(target: Target, part: NDArray[np.int32], part_area: NDArray[np.float64], angle: float) -> Target:
+def _turn_panels(target: Target, part: Int32, part_area: Float, angle: float) -> Target:
     vertices = target.vertices_m.copy()
     normals = target.surface.corner_normal.copy()
     for number in np.flatnonzero(part_area > _PANEL_AREA_SHARE * part_area.sum()):
@@ -93,7 +93,7 @@ def _turn_panels(target: Target, part: NDArray[np.int32], part_area: NDArray[np.
     return replace(target, vertices_m=vertices, surface=replace(target.surface, corner_normal=normals))
 
 
-def _recolor(target: Target, part: NDArray[np.int32], mismatch: Mismatch) -> Target:
+def _recolor(target: Target, part: Int32, mismatch: Mismatch) -> Target:
     rng = np.random.default_rng([mismatch.seed, 5])
     surface = target.surface
     part_gain = 1 + 0.7 * mismatch.recolor * rng.uniform(-1, 1, (part.max() + 1, 3))
@@ -110,11 +110,11 @@ def _recolor(target: Target, part: NDArray[np.int32], mismatch: Mismatch) -> Tar
     )
 
 
-def _scaled(rgb: NDArray[np.uint8], gain: NDArray[np.float64]) -> NDArray[np.uint8]:
+def _scaled(rgb: UInt8, gain: Float) -> UInt8:
     return srgb_from_linear(linear_from_srgb(rgb) * gain)
 
 
-def _select(target: Target, keep: NDArray[np.bool_]) -> Target:
+def _select(target: Target, keep: Bool) -> Target:
     used, faces = np.unique(target.faces[keep], return_inverse=True)
     s = target.surface
     surface = Surface(

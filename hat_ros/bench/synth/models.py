@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
+from hat_ros.array_types import Float
 from hat_ros.errors import UsageError
 from hat_ros.target.model import Target, target_from_scene
 
@@ -212,6 +212,6 @@ def _turned(outline: list[tuple[float, float]], base: tuple[float, ...]) -> trim
     return _moved(trimesh.creation.revolve(np.array(outline), sections=40), base)
 
 
-def _moved(mesh: trimesh.Trimesh, offset: tuple[float, ...] | NDArray[np.float64]) -> trimesh.Trimesh:
+def _moved(mesh: trimesh.Trimesh, offset: tuple[float, ...] | Float) -> trimesh.Trimesh:
     mesh.apply_translation(offset)
     return mesh

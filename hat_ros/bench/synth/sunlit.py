@@ -11,14 +11,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
+from hat_ros.array_types import Float, Float32, Int32
 from hat_ros.target.embree import EmbreeRenderer, pixel_rays
 from hat_ros.target.model import Surface, Target, linear_from_srgb
 from hat_ros.types import Camera
-
-Float32 = NDArray[np.float32]
 
 # Face normals closer than this are smoothed over, so that turned parts look round and box edges stay sharp.
 _CREASE_DEG = 35.0
@@ -36,9 +34,9 @@ class Light:
         earthshine: light from that side, falling off with the cosine to the far side.
     """
 
-    to_sun_cam: NDArray[np.float64]
+    to_sun_cam: Float
     ambient: float = 0.004
-    to_earth_cam: NDArray[np.float64] | None = None
+    to_earth_cam: Float | None = None
     earthshine: float = 0.0
 
 
@@ -59,7 +57,7 @@ class SunlitRenderer:
         self._normals = smoothed_normals(target)
         self._albedo = _MipSampler(target)
 
-    def render(self, T_cam_target: NDArray[np.float64], camera: Camera, light: Light) -> tuple[Float32, Float32]:
+    def render(self, T_cam_target: Float, camera: Camera, light: Light) -> tuple[Float32, Float32]:
         """Radiance (H, W, 3), premultiplied by coverage, and coverage (H, W) of the target, 0..1."""
         radiance = np.zeros((camera.height, camera.width, 3), np.float32)
         coverage = np.zeros((camera.height, camera.width), np.float32)
@@ -89,14 +87,14 @@ class SunlitRenderer:
 
     def _shade(
         self,
-        face: NDArray[np.int32],
+        face: Int32,
         barycentric: Float32,
         points: Float32,
         directions: Float32,
         footprint_m: Float32,
         to_sun: Float32,
         light: Light,
-        R_cam_target: NDArray[np.float64],
+        R_cam_target: Float,
     ) -> Float32:
         """Radiance (N, 3) at hits, everything in the target frame."""
         to_eye = -directions / np.linalg.norm(directions, axis=1, keepdims=True)
@@ -192,7 +190,7 @@ class _MipSampler:
         sizes = np.array([texture.shape[0] * texture.shape[1] for texture in target.surface.textures] + [0])
         self._texels_per_m = np.sqrt(texels * sizes[self._surface.texture_id] / area_m2).astype(np.float32)
 
-    def sample(self, face: NDArray[np.int32], barycentric: Float32, footprint_m: Float32) -> Float32:
+    def sample(self, face: Int32, barycentric: Float32, footprint_m: Float32) -> Float32:
         """(N,), (N, 3), (N,) -> (N, 3) linear albedo."""
         out = self._face_rgb[face]
         if self._surface.corner_rgb is not None:
@@ -223,5 +221,5 @@ def _bilinear(texture: Float32, uv: Float32) -> Float32:
     return top * (1 - fy) + (texture[yb, xa] * (1 - fx) + texture[yb, xb] * fx) * fy
 
 
-def _unit(vector: NDArray[np.float64]) -> Float32:
+def _unit(vector: Float) -> Float32:
     return (vector / np.linalg.norm(vector)).astype(np.float32)
