@@ -1,5 +1,29 @@
-"""The configuration: :mod:`~hat_ros.config.schema` says what there is, :mod:`~hat_ros.config.loader` reads it."""
+"""The configuration.
 
+:mod:`~hat_ros.config.schema` says what there is (its sections are in :mod:`~hat_ros.config.front_ends` and
+:mod:`~hat_ros.config.estimation`), :mod:`~hat_ros.config.loader` reads it.
+"""
+
+from hat_ros.config.estimation import (
+    AlignmentConfig,
+    FusionConfig,
+    KeyframeConfig,
+    PriorConfig,
+    RefinementConfig,
+    SelectorConfig,
+)
+from hat_ros.config.front_ends import (
+    ClassicalConfig,
+    DroidConfig,
+    FeatureSlamConfig,
+    HypothesesConfig,
+    Mask2FormerConfig,
+    MegaPoseConfig,
+    PicoPoseConfig,
+    SegmentationConfig,
+    SlamConfig,
+    TemplateConfig,
+)
 from hat_ros.config.loader import (
     config_from_dict,
     config_to_dict,
@@ -8,29 +32,11 @@ from hat_ros.config.loader import (
     preset_folder,
     preset_names,
 )
-from hat_ros.config.schema import (
-    AlignmentConfig,
-    ClassicalConfig,
-    DroidConfig,
-    FeatureSlamConfig,
-    FusionConfig,
-    GraphConfig,
-    HatConfig,
-    HypothesesConfig,
-    KeyframeConfig,
-    Mask2FormerConfig,
-    MegaPoseConfig,
-    NetsConfig,
-    PicoPoseConfig,
-    PriorConfig,
-    RefinementConfig,
-    SegmentationConfig,
-    SelectorConfig,
-    SlamConfig,
-    TemplateConfig,
-)
+from hat_ros.config.option import LEVELS, Level, describe
+from hat_ros.config.schema import GraphConfig, HatConfig, NetsConfig
 
 __all__ = [
+    "LEVELS",
     "AlignmentConfig",
     "ClassicalConfig",
     "DroidConfig",
@@ -40,6 +46,7 @@ __all__ = [
     "HatConfig",
     "HypothesesConfig",
     "KeyframeConfig",
+    "Level",
     "Mask2FormerConfig",
     "MegaPoseConfig",
     "NetsConfig",
@@ -52,6 +59,7 @@ __all__ = [
     "TemplateConfig",
     "config_from_dict",
     "config_to_dict",
+    "describe",
     "flat_options",
     "load_config",
     "preset_folder",

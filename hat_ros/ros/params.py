@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 
-from hat_ros.config import HatConfig, config_from_dict, config_to_dict, flat_options, load_config
+from hat_ros.config import HatConfig, config_from_dict, config_to_dict, describe, flat_options, load_config
 from hat_ros.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ def _configure(name_or_file: str, overrides: dict[str, Any]) -> HatConfig:
 
 
 def _descriptor(metadata: Any, value: Any) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(description=metadata["doc"], read_only=True, dynamic_typing=value is None)
+    descriptor = ParameterDescriptor(description=describe(metadata), read_only=True, dynamic_typing=value is None)
     low, high = metadata.get("low"), metadata.get("high")
     if metadata.get("choices"):
         descriptor.additional_constraints = f"one of {', '.join(metadata['choices'])}"

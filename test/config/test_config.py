@@ -6,6 +6,7 @@ import pytest
 import yaml
 
 from hat_ros.config import (
+    LEVELS,
     HatConfig,
     config_from_dict,
     config_to_dict,
@@ -125,6 +126,44 @@ def test_overrides_beat_the_file_and_are_checked():
     for override in ("fusion.relative_weight", "=1", "fusion.relative_weight.more=1", "fusion.relative_weight=[1"):
         with pytest.raises(ConfigError):
             load_config("default", [override])
+
+
+# The unit that the end of a name promises; a count of frames has "frames".
+SUFFIXES = {
+    "_px": "px",
+    "_deg": "deg",
+    "_per_deg": "1/deg",
+    "_per_frame": "deg/frame",
+    "_deg_s2": "deg/s^2",
+    "_radii_s2": "radii/s^2",
+    "_per_rad": "m/rad",
+    "_m": "m",
+    "_s": "s",
+    "_ms": "ms",
+    "_frames": "frames",
+    "_keyframes": "keyframes",
+}
+
+
+def test_every_option_has_a_level_and_the_unit_that_its_name_promises():
+    for name, (value, item) in flat_options().items():
+        assert item.metadata["level"] in LEVELS, name
+        suffix = max((end for end in SUFFIXES if name.endswith(end)), key=len, default=None)
+        if suffix is not None:
+            assert item.metadata["unit"] == SUFFIXES[suffix], name
+        if item.metadata["unit"]:
+            assert type(value) in (int, float), name
+
+
+def test_the_papers_symbols_stand_for_one_option_each():
+    symbols = {}
+    for name, (_, item) in flat_options().items():
+        if item.metadata["symbol"]:
+            assert item.metadata["level"] == "paper", name
+            symbols.setdefault(item.metadata["symbol"], []).append(name)
+    expected = {"K", "alpha", "mu", "s0", "gamma", "w_min", "lambda", "w", "D", "g", "delta"}
+    assert set(symbols) == expected
+    assert all(len(names) == 1 for names in symbols.values()), symbols
 
 
 def test_every_option_describes_itself_and_accepts_its_default():

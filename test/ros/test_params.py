@@ -9,7 +9,7 @@ import pytest
 import rclpy
 from rclpy.parameter import Parameter
 
-from hat_ros.config import flat_options
+from hat_ros.config import describe, flat_options
 from hat_ros.errors import ConfigError
 from hat_ros.ros.environment import (
     OPENCV_THREADS,
@@ -49,8 +49,9 @@ def test_every_option_is_a_parameter_with_its_description(make):
     node = make()
     for name, (_, field) in flat_options().items():
         descriptor = node.describe_parameter(name)
-        assert descriptor.description == field.metadata["doc"]
+        assert descriptor.description == describe(field.metadata)
         assert descriptor.read_only
+    assert node.describe_parameter("fusion.gate_angle_deg").description.endswith("[deg, paper: D]")
     assert node.describe_parameter("selector.warmup_keyframes").integer_range[0].from_value == 1
     assert node.describe_parameter("fusion.gate_weight").floating_point_range[0].to_value == 1.0
     assert "huber" in node.describe_parameter("fusion.loss").additional_constraints
