@@ -185,7 +185,7 @@ def test_noise_supports_no_pose(refiner, target, sigma):
     frame = Frame(1, np.clip(np.rint(noise), 0, 255).astype(np.uint8), CAMERA)
     for _ in range(5):
         refined = refiner.refine(frame, None, random_pose(rng, target))
-        assert not is_supported(refined, ENABLED.refinement)
+        assert not is_supported(refined, ENABLED)
 
 
 def test_a_pose_behind_the_camera_is_no_error(refiner, target):

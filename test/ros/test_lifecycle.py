@@ -95,7 +95,7 @@ def test_a_node_that_says_something_new_is_not_given_up(executor, clean_bag):
     progress = []
     for text in ("busy: 8 of 162", "busy: 8 of 162", "busy: 16 of 162"):
         player.progress_s = 0.0
-        player._on_diagnostics(player.messages.diagnostics(0, "hat: hypotheses", base.OK, text, {}))
+        player._on_diagnostics(player.wire.diagnostics(0, "hat: hypotheses", base.OK, text, {}))
         progress.append(player.progress_s > 0.0)
     assert progress == [True, False, True]
     player.progress_s = 0.0
@@ -250,4 +250,4 @@ def test_launch_files_compile_and_ship_what_they_name():
     compile(launch.read_text(encoding="utf-8"), str(launch), "exec")
     for node in ("segmentation", "hypotheses", "slam", "selector", "fusion"):
         assert node in launch.read_text()
-        assert (PACKAGE / "nodes" / f"{node}_node.py").is_file()
+        assert (PACKAGE / "ros" / f"{node}_node.py").is_file()

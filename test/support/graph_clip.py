@@ -90,6 +90,6 @@ def node_pid(name: str) -> int:
             parent = int((folder / "stat").read_text().rsplit(")", 1)[1].split()[1])
         except (OSError, ValueError):
             continue
-        if parent == os.getpid() and re.search(rf"hat_ros\.nodes\.{name}(_node)?\0".encode(), command):
+        if parent == os.getpid() and re.search(rf"hat_ros\.ros\.{name}(_node)?\0".encode(), command):
             return int(folder.name)
     raise LookupError(f"no process of node {name}")

@@ -320,9 +320,9 @@ def test_evidence_is_what_can_be_seen():
 
 
 def test_a_quiet_frame_costs_one_refinement(scene):
-    stage = _stage(scene)
+    refiner = BasinRefiner(scene)
+    stage = FusionStage(preset("default"), ImageFusion(preset("default"), refiner))
     _run(stage, scene, range(40))
-    refiner = stage._refiner
     refiner.calls = 0
     _run(stage, scene, range(41, 48))
     assert refiner.calls == 7
@@ -332,16 +332,17 @@ def test_a_rate_that_no_image_has_confirmed_of_late_is_not_tried(scene):
     def dark(index):
         return {"true": (0.9, 0.9)} if index < 41 else {}
 
-    stage = _stage(scene, dark, coast_limit_frames=60)
+    refiner, config = BasinRefiner(scene, dark), preset("default", fusion={"coast_limit_frames": 60})
+    stage = FusionStage(config, ImageFusion(config, refiner))
     _run(stage, scene, range(41))
-    stage._refiner.calls = 0
+    refiner.calls = 0
     still = scene.observations.motion(40)  # the target turns on, the motion does not say so
     for i in range(41, 61):
         frame = Frame((i + 1) * 10**8, np.zeros((1, 1, 3), np.uint8), Camera(np.eye(3), 1, 1))
         stage.update(frame, None, still, Selection.none())
     turned_deg = rotation_error_deg(scene.T_cam_target[60], scene.T_cam_target[40])
     assert turned_deg > 2 * preset("default").refinement.same_pose_deg
-    assert stage._refiner.calls <= 21  # the first of these frames may try the rate
+    assert refiner.calls <= 21  # the first of these frames may try the rate
 
 
 def test_before_the_alignment_the_constant_rate_says_how_far_the_target_moves(scene):

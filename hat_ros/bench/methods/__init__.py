@@ -13,12 +13,15 @@ Each offers what :class:`~hat_ros.tracker.HatTracker` offers, so the pipeline ru
 from __future__ import annotations
 
 from importlib import import_module
+from typing import TYPE_CHECKING
 
-from hat_ros.app.pipeline import Method
-from hat_ros.config import HatConfig
 from hat_ros.errors import UsageError
-from hat_ros.target.model import Target
-from hat_ros.tracker import StageWrapper, unwrapped
+
+if TYPE_CHECKING:  # the temporal stages alone (`hat temporal`) need no image processing
+    from hat_ros.app.pipeline import Method
+    from hat_ros.config import HatConfig
+    from hat_ros.target.model import Target
+    from hat_ros.tracker import StageWrapper
 
 _METHODS = {
     "hat": "framewise:Hat",
@@ -31,7 +34,7 @@ _METHODS = {
 MODES = tuple(_METHODS)
 
 
-def create_method(mode: str, config: HatConfig, target: Target, wrap: StageWrapper = unwrapped) -> Method:
+def create_method(mode: str, config: HatConfig, target: Target, wrap: StageWrapper) -> Method:
     """Build the method that ``--mode`` names; ``wrap`` as for :class:`~hat_ros.tracker.HatTracker`.
 
     Raises:

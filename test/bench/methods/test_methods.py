@@ -13,7 +13,7 @@ from hat_ros.errors import UsageError
 from hat_ros.geometry import lie
 from hat_ros.stages import BACKENDS, OFFLINE_MOTIONS
 from hat_ros.target.rendering import create_renderer
-from hat_ros.tracker import HatTracker
+from hat_ros.tracker import HatTracker, unwrapped
 from hat_ros.types import Camera, Frame, TrackState
 
 CAMERA = Camera(np.array([[300.0, 0, 79.5], [0, 300.0, 59.5], [0, 0, 1]]), 160, 120)
@@ -51,7 +51,7 @@ def knowing(monkeypatch):
 
 
 def run(mode, frames, target, **more):
-    method = create_method(mode, config_from_dict(SETTINGS | more), target)
+    method = create_method(mode, config_from_dict(SETTINGS | more), target, unwrapped)
     steps = [method.step(frame) for frame in frames]
     return steps, method
 
@@ -71,7 +71,7 @@ def blind(frame):
 
 def test_unknown_mode_is_refused(target):
     with pytest.raises(UsageError, match="'magic' is unknown"):
-        create_method("magic", config_from_dict(SETTINGS), target)
+        create_method("magic", config_from_dict(SETTINGS), target, unwrapped)
 
 
 @pytest.mark.parametrize("mode", [mode for mode in MODES if mode != "offline"])
