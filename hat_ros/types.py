@@ -18,6 +18,9 @@ from hat_ros.errors import CandidateError, FrameError
 from hat_ros.geometry import lie
 
 MAX_IMAGE_SIDE_PX = 8192
+# Values of a given mask (``Frame.given_mask``), beside 0 for outside.
+MASK_SILHOUETTE = 255
+MASK_BOX = 128  # inside a box whose silhouette is unknown
 
 
 @dataclass(frozen=True)

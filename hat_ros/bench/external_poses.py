@@ -30,7 +30,7 @@ from hat_ros.bench.source import Source, SourceSpec
 from hat_ros.config import HatConfig
 from hat_ros.errors import InputError, UsageError
 from hat_ros.geometry import lie
-from hat_ros.io.bag import BagReader
+from hat_ros.io.bag_reader import BagReader
 from hat_ros.io.provenance import describe_run, input_hash
 from hat_ros.io.result_bag import ResultBagWriter
 from hat_ros.io.results import CONFIG_FILE, RUN_FILE, ResultFolder, write_json

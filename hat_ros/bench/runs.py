@@ -21,7 +21,7 @@ from hat_ros.bench.methods import create_method
 from hat_ros.bench.source import Source, SourceSpec
 from hat_ros.config import HatConfig
 from hat_ros.errors import HatError, MissingDependencyError, RunError, UsageError
-from hat_ros.io.bag import BagReader
+from hat_ros.io.bag_reader import BagReader
 from hat_ros.io.provenance import describe_run
 from hat_ros.io.result_bag import ResultBagWriter, read_stage_ms
 from hat_ros.io.results import RUN_FILE, LiveTables, ResultFolder, write_config, write_json, write_overlaps

@@ -17,9 +17,10 @@ from hat_ros.bench.datasets.importer import open_dataset, with_annotation_boxes,
 from hat_ros.bench.datasets.sequence import load_sequence
 from hat_ros.errors import BagError, DatasetError, FrameError, UsageError
 from hat_ros.geometry import lie
-from hat_ros.io.bag import BagReader, Packet, deserialize
+from hat_ros.io.bag_reader import BagReader, Packet
 from hat_ros.io.images import decode_image, decode_mask
 from hat_ros.io.provenance import input_hash
+from hat_ros.io.rosbag import deserialize
 from hat_ros.target.model import Target, load_target
 from hat_ros.types import Frame
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,7 @@ import numpy as np
 
 from hat_ros.array_types import UInt8
 from hat_ros.errors import DatasetError
-from hat_ros.segmentation.annotated import BOX, SILHOUETTE
-from hat_ros.types import MAX_IMAGE_SIDE_PX
+from hat_ros.types import MASK_BOX, MASK_SILHOUETTE, MAX_IMAGE_SIDE_PX
 
 MAX_FILE_BYTES = 1 << 30
 MASK_SUFFIXES = (".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg")
@@ -115,19 +115,20 @@ def _from_folder(folder: Path) -> DetectionLookup:
     for file in files:
         if _key(file.name) in entries:
             raise DatasetError(f"{folder}: two masks for frame '{file.stem}', keep one")
-        entries[_key(file.name)] = lambda _size, file=file: _read_mask(file)
+        entries[_key(file.name)] = partial(_read_mask, file)
     return DetectionLookup(entries, folder)
 
 
-def _read_mask(file: Path) -> Mask:
+def _read_mask(file: Path, size: tuple[int, int]) -> Mask:
+    del size  # a file has its own; the caller compares
     image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise DatasetError(f"{file}: not a readable image")
-    if not (image > BOX).any() and (image == BOX).any():
-        return np.where(image == BOX, BOX, 0).astype(np.uint8)
+    if not (image > MASK_BOX).any() and (image == MASK_BOX).any():
+        return np.where(image == MASK_BOX, MASK_BOX, 0).astype(np.uint8)
     # Masks are often stored as 0/1 instead of 0/255.
     threshold = 127 if image.max(initial=0) > 1 else 0
-    return np.where(image > threshold, SILHOUETTE, 0).astype(np.uint8)
+    return np.where(image > threshold, MASK_SILHOUETTE, 0).astype(np.uint8)
 
 
 def _from_bop_list(data: list[Any], path: Path, scene: tuple[int, int] | None) -> DetectionLookup:
@@ -149,10 +150,10 @@ def _from_bop_list(data: list[Any], path: Path, scene: tuple[int, int] | None) -
     for key, (_, item) in best.items():
         where = f"{path}: image {item['image_id']}"
         if item.get("segmentation") is not None:
-            entries[key] = lambda _size, item=item, where=where: decode_rle(item["segmentation"], where)
+            entries[key] = partial(_rle_mask, item["segmentation"], where)
         else:
             x, y, w, h = _four_numbers(item["bbox"], where)
-            entries[key] = lambda size, box=(x, y, x + w, y + h), where=where: _box_mask(box, size, where)
+            entries[key] = partial(_box_mask, (x, y, x + w, y + h), where)
     return DetectionLookup(entries, path)
 
 
@@ -177,24 +178,29 @@ def _from_box_mapping(data: dict[str, Any], path: Path) -> DetectionLookup:
         numbers = _four_numbers(box, where)
         if _key(name) in entries:
             raise DatasetError(f"{where}: a second box for the same frame, keep one")
-        entries[_key(name)] = lambda size, box=numbers, where=where: _box_mask(box, size, where)
+        entries[_key(name)] = partial(_box_mask, numbers, where)
     return DetectionLookup(entries, path)
 
 
 def _four_numbers(value: Any, where: str) -> tuple[float, float, float, float]:
     ok = isinstance(value, list) and len(value) == 4
-    ok = ok and all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in value)
-    if not ok:
+    if not ok or not all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in value):
         raise DatasetError(f"{where}: a box must be four finite numbers, found {value!r}")
-    return tuple(float(v) for v in value)  # type: ignore[return-value]
+    a, b, c, d = value
+    return float(a), float(b), float(c), float(d)
 
 
-def _box_mask(box: tuple[float, float, float, float], size: tuple[int, int], where: str) -> Mask:
+def _rle_mask(segmentation: Any, where: str, size: tuple[int, int]) -> Mask:
+    del size  # run lengths have their own; the caller compares
+    return decode_rle(segmentation, where)
+
+
+def _box_mask(box: tuple[float, float, float, float], where: str, size: tuple[int, int]) -> Mask:
     x0, y0, x1, y1 = (math.floor(v + 0.5) for v in box)
     if x1 <= x0 or y1 <= y0:
         raise DatasetError(f"{where}: the box {list(box)} is empty; expected x0 < x1 and y0 < y1")
     mask = np.zeros(size, np.uint8)
-    mask[max(0, y0) : max(0, y1), max(0, x0) : max(0, x1)] = BOX
+    mask[max(0, y0) : max(0, y1), max(0, x0) : max(0, x1)] = MASK_BOX
     return mask
 
 
@@ -221,7 +227,7 @@ def decode_rle(segmentation: Any, where: str = "segmentation") -> Mask:
     if sum(counts) != size[0] * size[1]:
         raise DatasetError(f"{where}: run lengths add up to {sum(counts)} px, the size says {size[0] * size[1]}")
     values = np.zeros(len(counts), np.uint8)
-    values[1::2] = SILHOUETTE
+    values[1::2] = MASK_SILHOUETTE
     return np.ascontiguousarray(np.repeat(values, counts).reshape(size[1], size[0]).T)
 
 

@@ -11,16 +11,15 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from hat_ros.array_types import UInt8
 from hat_ros.errors import FrameError
-from hat_ros.types import MAX_IMAGE_SIDE_PX, Detection
+from hat_ros.types import MASK_BOX, MASK_SILHOUETTE, MAX_IMAGE_SIDE_PX, Detection
 
-SILHOUETTE = 255
-BOX = 128
 # 1 for all values that a mask may not hold: looked up five times faster than compared.
 _NO_MASK_VALUE = np.ones(256, np.uint8)
-_NO_MASK_VALUE[[0, BOX, SILHOUETTE]] = 0
+_NO_MASK_VALUE[[0, MASK_BOX, MASK_SILHOUETTE]] = 0
 
 # encoding -> (channels, cv2 conversion to RGB or None). A ROS Bayer name gives the first two pixels of the first row,
 # an OpenCV one those of the second row from the second column on: hence the crossed pairs.
@@ -53,7 +52,7 @@ def decode_image(message: Any) -> UInt8:
     encoding = message.encoding
     if encoding in _ENCODINGS_16:
         raw = pixels_of(message, 2)
-        return cv2.cvtColor(np.ascontiguousarray(raw[..., 0 if message.is_bigendian else 1]), cv2.COLOR_GRAY2RGB)
+        return _converted(raw[..., 0 if message.is_bigendian else 1], cv2.COLOR_GRAY2RGB)
     if encoding not in _ENCODINGS:
         known = ", ".join((*_ENCODINGS, *_ENCODINGS_16))
         raise FrameError(f"image encoding '{encoding}' is not supported, use one of {known}")
@@ -61,7 +60,7 @@ def decode_image(message: Any) -> UInt8:
     raw = pixels_of(message, channels)
     if conversion is None:
         return np.ascontiguousarray(raw)
-    return cv2.cvtColor(np.ascontiguousarray(raw[..., 0] if channels == 1 else raw), conversion)
+    return _converted(raw[..., 0] if channels == 1 else raw, conversion)
 
 
 def decode_mask(message: Any) -> UInt8 | None:
@@ -76,7 +75,7 @@ def decode_mask(message: Any) -> UInt8 | None:
         raise FrameError(f"detection mask must be mono8, found '{message.encoding}'")
     mask = np.ascontiguousarray(pixels_of(message, 1)[..., 0])
     if cv2.LUT(mask, _NO_MASK_VALUE).any():
-        raise FrameError(f"detection mask may hold 0, {BOX} (box) and {SILHOUETTE} (silhouette) only")
+        raise FrameError(f"detection mask may hold 0, {MASK_BOX} (box) and {MASK_SILHOUETTE} (silhouette) only")
     return mask
 
 
@@ -104,7 +103,26 @@ def _decode_compressed(data: bytes) -> UInt8:
         raise FrameError(f"compressed image cannot be decoded ({error.err})") from None
     if bgr is None:
         raise FrameError("compressed image cannot be decoded: the data are damaged")
-    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+    return _converted(bgr, cv2.COLOR_BGR2RGB)
+
+
+def _converted(pixels: NDArray, conversion: int) -> UInt8:
+    """OpenCV's colour conversion of uint8 pixels, which gives uint8."""
+    return cv2.cvtColor(np.ascontiguousarray(pixels), conversion).astype(np.uint8, copy=False)
+
+
+def encode_image(rgb: UInt8, image_format: str, jpeg_quality: int = 95) -> bytes:
+    """(H, W, 3) uint8 RGB as the bytes of an image file.
+
+    Args:
+        rgb: the image.
+        image_format: ``png`` or ``jpeg``.
+        jpeg_quality: 1 to 100.
+    """
+    bgr = _converted(rgb, cv2.COLOR_RGB2BGR)
+    if image_format == "png":
+        return cv2.imencode(".png", bgr)[1].tobytes()
+    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality])[1].tobytes()
 
 
 def _declared_size(data: bytes) -> tuple[int, int]:
@@ -140,11 +158,11 @@ def rgba_from(rgb: UInt8, detection: Detection | None) -> UInt8:
 
     255 = target silhouette, 128 = inside a box whose silhouette is unknown, 0 = outside; 0 everywhere = no detection.
     """
-    rgba = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2RGBA)
+    rgba = _converted(rgb, cv2.COLOR_RGB2RGBA)
     if detection is None:
         rgba[..., 3] = 0
     else:
-        rgba[..., 3] = detection.mask * np.uint8(SILHOUETTE if detection.silhouette else BOX)
+        rgba[..., 3] = detection.mask * np.uint8(MASK_SILHOUETTE if detection.silhouette else MASK_BOX)
     return rgba
 
 
@@ -155,12 +173,13 @@ def split_rgba(rgba: UInt8) -> tuple[UInt8, Detection | None]:
         FrameError: alpha holds anything but one of the two mask values.
     """
     rgba = np.ascontiguousarray(rgba)
-    rgb = cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB)
+    rgb = _converted(rgba, cv2.COLOR_RGBA2RGB)
     alpha = np.ascontiguousarray(rgba[..., 3])
     mask = alpha != 0
     value = int(alpha.max())
     if value == 0:
         return rgb, None
-    if value not in (BOX, SILHOUETTE) or np.count_nonzero(alpha == value) != np.count_nonzero(mask):
-        raise FrameError(f"alpha must be 0 and either {BOX} (box) or {SILHOUETTE} (silhouette), found up to {value}")
-    return rgb, Detection(mask, value == SILHOUETTE)
+    if value not in (MASK_BOX, MASK_SILHOUETTE) or np.count_nonzero(alpha == value) != np.count_nonzero(mask):
+        values = f"{MASK_BOX} (box) or {MASK_SILHOUETTE} (silhouette)"
+        raise FrameError(f"alpha must be 0 and either {values}, found up to {value}")
+    return rgb, Detection(mask, value == MASK_SILHOUETTE)

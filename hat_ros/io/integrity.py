@@ -1,4 +1,4 @@
-"""What must hold of an MCAP file before a parser allocates anything from what it declares (DESIGN section 7).
+"""What must hold of an MCAP file before a parser allocates anything from what it declares.
 
 MCAP layout: https://mcap.dev/spec (magic, records of one opcode byte and a 64-bit length, chunks with their declared
 uncompressed size).
@@ -9,18 +9,25 @@ from __future__ import annotations
 import io
 import struct
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Protocol
 
-import lz4.frame
 import zstandard
 
-from hat_ros.errors import BagError
+from hat_ros.errors import BagError, MissingDependencyError
 
 MAX_CHUNK_BYTES = 512 * 2**20
 
 _MAGIC = b"\x89MCAP0\r\n"
 _CHUNK = 0x06
 _FOOTER = 0x02
+
+
+class Readable(Protocol):
+    """A stream of unpacked bytes."""
+
+    def read(self, size: int, /) -> bytes:
+        """At most so many bytes; none at the end."""
+        ...
 
 
 def check_mcap(path: Path) -> None:
@@ -71,14 +78,72 @@ def _inflated(data: bytes, compression: str, declared: int, path: Path) -> int:
     """Number of bytes the data unpack to, counted up to one more than declared."""
     count, limit = 0, declared + 1
     try:
-        if compression == "zstd":
-            source = zstandard.ZstdDecompressor().stream_reader(io.BytesIO(data), read_across_frames=True)
-        elif compression == "lz4":
-            source = lz4.frame.LZ4FrameFile(io.BytesIO(data))
-        else:
-            raise BagError(f"{path}: chunk compression '{compression}' is not supported (zstd, lz4 or none)")
+        source = _stream(data, compression, path)
         while count < limit and (block := source.read(min(2**20, limit - count))):
             count += len(block)
     except (zstandard.ZstdError, RuntimeError, EOFError, OSError) as error:
         raise BagError(f"{path} is damaged: a chunk cannot be unpacked ({error})") from None
     return count
+
+
+def _stream(data: bytes, compression: str, path: Path) -> Readable:
+    if compression == "zstd":
+        return zstandard.ZstdDecompressor().stream_reader(io.BytesIO(data), read_across_frames=True)
+    if compression != "lz4":
+        raise BagError(f"{path}: chunk compression '{compression}' is not supported (zstd, lz4 or none)")
+    # Bags of our own are written with zstd; LZ4 is asked for only where a bag of others needs it.
+    try:
+        from lz4.frame import LZ4FrameFile
+    except ModuleNotFoundError:
+        raise MissingDependencyError(
+            f"{path} has chunks compressed by LZ4, and the package 'lz4' is not installed: `pip install lz4`"
+        ) from None
+    return LZ4FrameFile(io.BytesIO(data))
+
+
+def _lz4_stream(data: bytes, path: Path) -> BinaryIO:
+    # Bags of our own need no LZ4, so this is asked for only where a bag of others does.
+    try:
+        from lz4.frame import LZ4FrameFile
+    except ModuleNotFoundError:
+        raise MissingDependencyError(
+            f"{path} has chunks compressed by LZ4, and the package 'lz4' is not installed: `pip install lz4`"
+        ) from None
+    stream: BinaryIO = LZ4FrameFile(io.BytesIO(data))
+    return stream
+
+
+def _lz4_stream(data: bytes, path: Path) -> BinaryIO:
+    # Bags of our own need no LZ4, so this is asked for only where a bag of others does.
+    try:
+        from lz4.frame import LZ4FrameFile
+    except ModuleNotFoundError:
+        raise MissingDependencyError(
+            f"{path} has chunks compressed by LZ4, and the package 'lz4' is not installed: `pip install lz4`"
+        ) from None
+    stream: BinaryIO = LZ4FrameFile(io.BytesIO(data))
+    return stream
+
+
+def _lz4_stream(data: bytes, path: Path) -> BinaryIO:
+    # Bags of our own need no LZ4, so this is asked for only where a bag of others does.
+    try:
+        from lz4.frame import LZ4FrameFile
+    except ModuleNotFoundError:
+        raise MissingDependencyError(
+            f"{path} has chunks compressed by LZ4, and the package 'lz4' is not installed: `pip install lz4`"
+        ) from None
+    stream: BinaryIO = LZ4FrameFile(io.BytesIO(data))
+    return stream
+
+
+def _lz4_stream(data: bytes, path: Path) -> BinaryIO:
+    # Bags of our own need no LZ4, so this is asked for only where a bag of others does.
+    try:
+        from lz4.frame import LZ4FrameFile
+    except ModuleNotFoundError:
+        raise MissingDependencyError(
+            f"{path} has chunks compressed by LZ4, and the package 'lz4' is not installed: `pip install lz4`"
+        ) from None
+    stream: BinaryIO = LZ4FrameFile(io.BytesIO(data))
+    return stream

@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.rosbag2 import Reader
 
 from hat_ros.array_types import Float
-from hat_ros.errors import BagError, HatError
+from hat_ros.errors import BagError
 from hat_ros.io import messages, topics
-from hat_ros.io.bag import TYPESTORE, BagWriter, check_manifest, deserialize
+from hat_ros.io.bag_writer import BagWriter
+from hat_ros.io.manifest import check_manifest
+from hat_ros.io.rosbag import TYPESTORE, deserialize, opened_bag
 from hat_ros.io.run_log import RunLog, RunLogBuilder
 from hat_ros.tracker import Step
 from hat_ros.types import Alignment, Camera, Candidates, Estimate, Motion
@@ -167,15 +168,9 @@ def _read(path: Path, names: Collection[str]) -> dict[str, list[Any]]:
         raise BagError(f"{path} is no result bag: it has no metadata.yaml (a run that was killed?)")
     check_manifest(path)
     out: dict[str, list[Any]] = {topic: [] for topic in names}
-    try:
-        with Reader(path) as reader:
-            wanted = [connection for connection in reader.connections if connection.topic in out]
-            if not wanted:
-                return out
+    with opened_bag(path) as reader:
+        wanted = [connection for connection in reader.connections if connection.topic in out]
+        if wanted:  # of no connections, the reader gives the messages of all
             for connection, _, data in reader.messages(connections=wanted):
                 out[connection.topic].append(deserialize(bytes(data), connection.msgtype, path))
-    except HatError:
-        raise
-    except Exception as error:  # whatever a parser of foreign bytes raises means one thing: the bag is damaged
-        raise BagError(f"{path} is damaged: {' '.join(str(error).split())[:200]}") from None
     return out

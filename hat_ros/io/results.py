@@ -7,7 +7,7 @@ frames.csv      every admitted frame: latency, time per stage (what the run meas
 masks.csv       frames with a recorded silhouette: overlap of the detected one with it
 config.yaml     the configuration as used
 run.json        where it came from: command, commit, versions, input hashes
-metrics.json    figures (DESIGN section 6)
+metrics.json    figures: errors, coverage, speed
 report.html     plots, overlay frames, table; one file, no network
 overlay.mp4     the clip with the CAD outline drawn in
 """

@@ -71,12 +71,12 @@ class RunLog:
     @cached_property
     def has_output(self) -> Bool:
         """(N,) a pose was published."""
-        return np.isfinite(self.T_est).all(axis=(-1, -2))
+        return np.asarray(np.isfinite(self.T_est).all(axis=(-1, -2)))
 
     @cached_property
     def has_truth(self) -> Bool:
         """(N,) the true pose is known."""
-        return np.isfinite(self.truth_rows).all(axis=-1)
+        return np.asarray(np.isfinite(self.truth_rows).all(axis=-1))
 
     @cached_property
     def reset(self) -> Bool:
@@ -164,7 +164,7 @@ class RunLogBuilder:
             "motion_valid": (np.bool_, ()),
             "motion_rows": (np.float64, (7,)),
         }
-        columns = {
+        columns: dict[str, Any] = {
             name: np.array([row[name] for row in self._rows], dtype=kind).reshape((len(self._rows), *shape))
             for name, (kind, shape) in shapes.items()
         }

@@ -1,4 +1,4 @@
-"""Names, types and table columns of every topic (DESIGN section 4); bags need them without any middleware."""
+"""Names, types and table columns of every topic (``docs/topics.md``); bags need them without any middleware."""
 
 from __future__ import annotations
 

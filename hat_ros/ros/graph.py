@@ -28,8 +28,9 @@ from hat_ros.array_types import Float
 from hat_ros.config import HatConfig, config_to_dict
 from hat_ros.errors import ConfigError, HatError, InputError, RunError, StageTimeoutError
 from hat_ros.io import topics
-from hat_ros.io.bag import TYPESTORE, BagReader
+from hat_ros.io.bag_reader import BagReader
 from hat_ros.io.messages import Status, Wire
+from hat_ros.io.rosbag import TYPESTORE
 from hat_ros.ros import base
 from hat_ros.ros.domain import reserved_domain
 from hat_ros.ros.environment import keep_large_blocks, prepare_environment
@@ -111,7 +112,7 @@ def replay(
         live: play in real time and let the graph drop what it cannot keep up with (W = 1).
         rate: speed of live play relative to the recording.
         stage_delays_ms: stage -> largest random extra time per frame, for latency studies.
-        image_topic: see :class:`~hat_ros.io.bag.BagReader`.
+        image_topic: see :class:`~hat_ros.io.bag_reader.BagReader`.
         camera_info_topic: likewise.
         first_frame: frames skipped at the beginning.
         max_frames: at most this many frames, None = all.

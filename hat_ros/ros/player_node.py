@@ -13,7 +13,7 @@ from rclpy.duration import Duration
 
 from hat_ros.errors import ConfigError, StageTimeoutError
 from hat_ros.io import messages, topics
-from hat_ros.io.bag import BagReader, Packet
+from hat_ros.io.bag_reader import BagReader, Packet
 from hat_ros.ros import base, process, qos
 
 _STAGES = ["segmentation", "hypotheses", "slam", "selector", "fusion"]

@@ -9,7 +9,8 @@ from typing import Any, ClassVar
 
 from hat_ros.errors import ConfigError
 from hat_ros.io import topics
-from hat_ros.io.bag import BagWriter, stamp_of_cdr
+from hat_ros.io.bag_writer import BagWriter
+from hat_ros.io.rosbag import stamp_of_cdr
 from hat_ros.ros import base, process, qos
 
 

@@ -9,10 +9,7 @@ import numpy as np
 from hat_ros.array_types import Bool
 from hat_ros.config import HatConfig
 from hat_ros.target.model import Target
-from hat_ros.types import Detection, Frame, PosePrior
-
-SILHOUETTE = 255
-BOX = 128
+from hat_ros.types import MASK_BOX, MASK_SILHOUETTE, Detection, Frame, PosePrior
 
 
 class AnnotatedSegmenter:
@@ -28,10 +25,10 @@ class AnnotatedSegmenter:
         given = frame.given_mask
         if given is None:
             return None
-        silhouette = given == SILHOUETTE
+        silhouette = given == MASK_SILHOUETTE
         if silhouette.any():
             return Detection(silhouette)
-        box = given == BOX
+        box = given == MASK_BOX
         if not box.any():
             return None
         return Detection(pad_box(box, self._padding), silhouette=False)

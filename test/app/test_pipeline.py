@@ -17,7 +17,7 @@ from hat_ros.app.pipeline import (
 from hat_ros.bench.source import open_source
 from hat_ros.bench.synth.models import write_model
 from hat_ros.errors import BagError, FrameError, UsageError
-from hat_ros.io.bag import BagWriter
+from hat_ros.io.bag_writer import BagWriter
 
 
 def run(frames):

@@ -17,7 +17,7 @@ from hat_ros.bench.synth.models import write_model
 from hat_ros.cli import main
 from hat_ros.errors import InputError, UsageError
 from hat_ros.geometry import lie
-from hat_ros.io.bag import BagWriter
+from hat_ros.io.bag_writer import BagWriter
 from hat_ros.io.results import METRICS_FILE, RUN_FILE, tum_line
 
 N = 6

@@ -13,7 +13,7 @@ from hat_ros.bench.synth.models import write_model
 from hat_ros.cli import build_parser, data, main, run
 from hat_ros.errors import RunError
 from hat_ros.geometry import lie
-from hat_ros.io.bag import BagWriter
+from hat_ros.io.bag_writer import BagWriter
 
 COMMANDS = ("replay", "track", "temporal", "import", "synth", "evaluate", "plot", "bench", "weights", "doctor")
 

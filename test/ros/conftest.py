@@ -9,7 +9,7 @@ from graph_clip import CONFIG_OVERRIDES, FIRST_NS, N_FRAMES, STEP_NS, run_in_pro
 from hat_ros.bench.synth.clips import ClipSpec, render_clip
 from hat_ros.bench.synth.models import write_model
 from hat_ros.config import load_config
-from hat_ros.io.bag import BagWriter
+from hat_ros.io.bag_writer import BagWriter
 from hat_ros.target.model import load_target
 
 SPEC = ClipSpec(

@@ -18,8 +18,8 @@ from rosbags.rosbag2 import Reader
 from hat_ros.bench.runs import ReplayOptions, replay_bag
 from hat_ros.config import load_config
 from hat_ros.io import topics
-from hat_ros.io.bag import TYPESTORE
 from hat_ros.io.result_bag import read_result_bag
+from hat_ros.io.rosbag import TYPESTORE
 from hat_ros.ros.base import ERROR
 from hat_ros.stages import create_backend
 from hat_ros.target.model import load_target

@@ -12,8 +12,9 @@ from rosbags.rosbag2 import Reader
 
 from hat_ros.config import HatConfig
 from hat_ros.io import messages, topics
-from hat_ros.io.bag import TYPESTORE, BagReader
+from hat_ros.io.bag_reader import BagReader
 from hat_ros.io.result_bag import ResultBagWriter
+from hat_ros.io.rosbag import TYPESTORE
 from hat_ros.target.model import load_target
 from hat_ros.tracker import HatTracker
 

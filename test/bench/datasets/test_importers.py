@@ -22,7 +22,7 @@ from hat_ros.bench.datasets.importer import (
 from hat_ros.bench.datasets.sequence import load_sequence, write_labels
 from hat_ros.errors import DatasetError, MeshError, UsageError
 from hat_ros.geometry import lie
-from hat_ros.io.bag import BagReader
+from hat_ros.io.bag_reader import BagReader
 from hat_ros.target.model import load_target
 from hat_ros.types import Camera
 

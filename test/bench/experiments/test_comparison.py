@@ -22,7 +22,7 @@ from hat_ros.bench.experiments.run_matrix import Job, run_jobs
 from hat_ros.bench.synth.models import write_model
 from hat_ros.errors import MissingDependencyError, RunError, UsageError
 from hat_ros.geometry import lie
-from hat_ros.io.bag import BagWriter
+from hat_ros.io.bag_writer import BagWriter
 from hat_ros.io.results import METRICS_FILE, RUN_FILE
 
 

@@ -15,7 +15,7 @@ from hat_ros.bench.synth.models import build_model, build_target, model_names, w
 from hat_ros.bench.synth.suite import CLIPS, SUITE, Clip, get_clip, synthesize, write_suite
 from hat_ros.errors import UsageError
 from hat_ros.geometry import lie
-from hat_ros.io.bag import BagReader
+from hat_ros.io.bag_reader import BagReader
 from hat_ros.target.model import load_target
 from hat_ros.target.rendering import create_renderer
 
