@@ -1,46 +1,73 @@
-# Two commands on a fresh machine: `make demo` and `make test`. Everything lands in .venv and out/.
+# Two commands on a fresh machine: `make demo` and `make test`. Everything lands in .venv and out/; `make help` lists all.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+PYTEST := ROS_PYTHON_CHECK_FIELDS=1 $(BIN)/python -m pytest
 
-.PHONY: demo test test-slow test-gpu lint install install-nets clean
+.PHONY: help demo test test-accuracy test-slow test-gpu lint types wheel-check wheel-oldest wheel-newest colcon-check \
+  install install-nets install-test clean
 .DELETE_ON_ERROR:
+
+help:  ## this list
+	@sed -nE 's/^([a-z-]+):.*## (.*)/\1 | \2/p' $(MAKEFILE_LIST) | column -t -s '|'
 
 demo: install  ## replay bags/demo through the five-node graph, print errors, write bag, overlay and report
 	$(BIN)/hat replay bags/demo --out out/demo --overwrite
 
-test: install-nets  ## lint and the whole suite
-	$(BIN)/ruff check hat_ros test launch setup.py
-	$(BIN)/ruff format --check hat_ros test launch setup.py
-	ROS_PYTHON_CHECK_FIELDS=1 $(BIN)/python -m pytest -m "not slow and not gpu"
+test: lint  ## lint and the whole suite, accuracy gate included; at most 12 minutes on two cores
+	$(PYTEST) -m "not slow and not gpu"
 
-test-slow: install-nets
-	ROS_PYTHON_CHECK_FIELDS=1 $(BIN)/python -m pytest -m "slow and not gpu"
+test-accuracy: install-test  ## the accuracy gate alone: the default preset on seeded clips
+	$(PYTEST) test/accuracy
 
-test-gpu: install-nets
-	ROS_PYTHON_CHECK_FIELDS=1 $(BIN)/python -m pytest -m gpu
+test-slow: install-test  ## tests that take minutes each
+	$(PYTEST) -m "slow and not gpu"
 
-lint: install-nets
-	$(BIN)/ruff check hat_ros test launch setup.py
-	$(BIN)/ruff format --check hat_ros test launch setup.py
+test-gpu: install-test  ## tests that need an accelerator
+	$(PYTEST) -m gpu
 
-install: $(VENV)/.base
-install-nets: $(VENV)/.nets
+lint: install-test  ## ruff: rules and format
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: install-test  ## mypy over the package
+	$(BIN)/mypy
+
+wheel-check: install  ## sdist, wheel, empty environment with the pinned versions: track and replay a clip
+	PYTHON=$(PYTHON) tools/check_wheel.sh pinned
+
+wheel-oldest: install  ## the same with every lower bound of pyproject.toml (PYTHON=python3.11)
+	PYTHON=$(PYTHON) tools/check_wheel.sh oldest
+
+wheel-newest: install  ## the same with the newest releases: a report, never fails
+	PYTHON=$(PYTHON) tools/check_wheel.sh newest
+
+colcon-check:  ## colcon build with the versions of Ubuntu 24.04's apt, then track a clip from the install space
+	PYTHON=$(PYTHON) tools/check_colcon.sh
+
+install: $(VENV)/.base  ## .venv with what runs: pinned, ROS as wheels, no torch
+install-nets: $(VENV)/.nets  ## and torch with what the learned backends need
+install-test: $(VENV)/.test  ## and the tools of lint, types and tests
 
 $(VENV)/bin/python:
-	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' || \
-	  { echo "hat_ros needs Python 3.10 to 3.13; choose one with: make PYTHON=python3.12 ..." >&2; exit 2; }
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \
+	  { echo "hat_ros needs Python 3.11 to 3.13; choose one with: make PYTHON=python3.12 ..." >&2; exit 2; }
 	@$(PYTHON) -m venv $(VENV) || \
 	  { rm -rf $(VENV); echo "creating .venv failed: on Debian and Ubuntu, apt install python3-venv" >&2; exit 2; }
 
-$(VENV)/.base: requirements.txt setup.py | $(VENV)/bin/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.txt
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+$(VENV)/.base: requirements.txt pyproject.toml setup.py | $(VENV)/bin/python
+	$(PIP) -r requirements.txt
+	$(PIP) --no-deps --no-build-isolation -e .
 	@touch $@
 
-$(VENV)/.nets: $(VENV)/.base requirements-test.txt
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-test.txt
+$(VENV)/.nets: $(VENV)/.base requirements-nets.txt
+	$(PIP) -r requirements-nets.txt
 	@touch $@
 
-clean:
+$(VENV)/.test: $(VENV)/.nets requirements-test.txt
+	$(PIP) -r requirements-test.txt
+	@touch $@
+
+clean:  ## remove .venv and everything made
 	rm -rf $(VENV) out build install log

@@ -10,13 +10,29 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import metadata
+from importlib.util import find_spec
 
 import numpy as np
 
 from hat_ros.errors import HatError
 
-_REQUIRED = ("numpy", "scipy", "opencv-python-headless", "trimesh", "embreex", "numba", "rosbags", "mcap", "PyYAML",
-             "rich", "matplotlib", "zstandard")  # fmt: skip
+# Module -> package on PyPI. Looked for by module: apt's OpenCV has no package metadata.
+_REQUIRED = {
+    "numpy": "numpy",
+    "scipy": "scipy",
+    "cv2": "opencv-python-headless",
+    "trimesh": "trimesh",
+    "embreex": "embreex",
+    "numba": "numba",
+    "rosbags": "rosbags",
+    "mcap": "mcap",
+    "lz4": "lz4",
+    "zstandard": "zstandard",
+    "yaml": "PyYAML",
+    "rich": "rich",
+    "matplotlib": "matplotlib",
+    "PIL": "pillow",
+}
 _OPTIONAL = {"torch": "nets", "transformers": "nets", "safetensors": "nets", "pyrender": "gl", "distributed": "cluster"}
 
 
@@ -52,15 +68,17 @@ def run_checks() -> list[Finding]:
 
 def _python() -> list[Finding]:
     version = ".".join(map(str, sys.version_info[:3]))
-    good = (3, 10) <= sys.version_info[:2] <= (3, 13)
-    return [Finding("Python", "ok" if good else "missing", version if good else f"{version}: 3.10 to 3.13 is needed")]
+    good = (3, 11) <= sys.version_info[:2] <= (3, 13)
+    return [Finding("Python", "ok" if good else "missing", version if good else f"{version}: 3.11 to 3.13 is needed")]
 
 
 def _packages() -> list[Finding]:
-    missing = [name for name in _REQUIRED if _version(name) is None]
+    missing = [package for module, package in _REQUIRED.items() if find_spec(module) is None]
     if missing:
-        return [Finding("packages", "missing", f"not installed: {', '.join(missing)}; run `make install`")]
-    return [Finding("packages", "ok", ", ".join(f"{name} {_version(name)}" for name in _REQUIRED))]
+        names = " ".join(missing)
+        return [Finding("packages", "missing", f"not installed; run `make install` or `pip install {names}`")]
+    found = (f"{package} {_version(package) or '(version not stated)'}" for package in _REQUIRED.values())
+    return [Finding("packages", "ok", ", ".join(found))]
 
 
 def _optional_packages() -> list[Finding]:
@@ -133,7 +151,8 @@ def _ros() -> list[Finding]:
     except subprocess.TimeoutExpired:
         return [Finding("rclpy", "missing", "importing it takes more than a minute")]
     if found.returncode != 0:
-        return [Finding("rclpy", "missing", "not importable; run `make install` (hat track works without it)")]
+        advice = "source your ROS 2, run `make install` or `pip install 'hat_ros[ros]'` (hat track works without)"
+        return [Finding("rclpy", "missing", f"not importable; {advice}")]
     out = [Finding("rclpy", "ok", found.stdout.strip())]
     try:
         dds = subprocess.run(

@@ -145,8 +145,8 @@ def replay_bag(
         from hat_ros.ros import graph
     except ImportError as error:
         raise MissingDependencyError(
-            f"hat replay needs ROS, which cannot be imported ({error}): run `make install`, source your ROS, "
-            f"or use `hat track`, which needs none"
+            f"hat replay needs ROS, which cannot be imported ({error}): source your ROS 2, run `make install` (or "
+            f"`pip install 'hat_ros[ros]'`), or use `hat track`, which needs none"
         ) from None
     folder = ResultFolder(out, options.overwrite)
     spec = SourceSpec(path)

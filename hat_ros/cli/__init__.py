@@ -10,8 +10,9 @@ import argparse
 import sys
 from collections.abc import Sequence
 
+from hat_ros import __version__
 from hat_ros.cli import analyse, bench, data, run, system
-from hat_ros.errors import HatError
+from hat_ros.errors import HatError, InputError
 
 EXIT_INTERRUPTED = 130
 
@@ -32,6 +33,7 @@ def build_parser() -> argparse.ArgumentParser:
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for group in (run, data, analyse, bench, system):
         group.add_commands(commands)
@@ -46,6 +48,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except HatError as error:
         print(f"hat: {' '.join(str(error).split())}", file=sys.stderr)
         return error.exit_code
+    except ModuleNotFoundError as error:  # a checkout that is not installed
+        if error.name is None or error.name.split(".")[0] == "hat_ros":
+            raise
+        print(f"hat: the package '{error.name}' is missing: run `make install` or `pip install .`", file=sys.stderr)
+        return InputError.exit_code
     except KeyboardInterrupt:
         print(
             "hat: stopped by Ctrl-C; what was done is in the .partial folder, if the command had begun one",
