@@ -13,7 +13,7 @@ class KeyframeConfig:
 
     gap_frames: int = option(6, "from one anchor attempt to the next", level="paper", unit="frames", low=1)
     settled_factor: int = option(
-        1, "the gap is this many times as long while the track is settled (needs prior.enabled)", low=1
+        3, "the gap is this many times as long while the track is settled (needs prior.enabled); 1: as published", low=1
     )
 
 
@@ -21,15 +21,15 @@ class KeyframeConfig:
 class SelectorConfig:
     """Stage 3: causal Viterbi selection."""
 
-    score_scale: float = option(3.0, "scale of the appearance score", level="paper", symbol="alpha", low=0)
+    score_scale: float = option(1.0, "scale of the appearance score", level="paper", symbol="alpha", low=0)
     motion_weight_per_deg: float = option(
         0.3, "penalty per degree of disagreement with the motion", level="paper", symbol="mu", unit="1/deg", low=0
     )
     max_motion_penalty: float = option(
-        0.0, "limit of that penalty: earlier candidates may be wrong; 0: none, as published", low=0
+        8.0, "limit of that penalty: earlier candidates may be wrong; 0: none, as published", low=0
     )
     max_turn_deg_per_frame: float = option(
-        0.0, "turn that costs nothing where motion is missing; 0: any, as published", unit="deg/frame", low=0
+        5.0, "turn that costs nothing where motion is missing; 0: any, as published", unit="deg/frame", low=0
     )
     warmup_keyframes: int = option(
         1,
@@ -127,7 +127,7 @@ class FusionConfig:
 class RefinementConfig:
     """Refinement of every fused pose on its own image (the paper's dense refinement, causal)."""
 
-    enabled: bool = option(False, "refine the fused pose on the current image", level="basic")
+    enabled: bool = option(True, "refine the fused pose on the current image", level="basic")
     render_px: int = option(160, "longer side of the views rendered for the contour", unit="px", low=48, high=512)
     max_points: int = option(300, "contour points used", low=50, high=5000)
     start_sigma_deg: float = option(5.0, "one sigma of the rotation that refinement starts from", unit="deg", low=0.01)
@@ -163,7 +163,7 @@ class RefinementConfig:
 class PriorConfig:
     """Fused poses of the past as a hint to the front ends."""
 
-    enabled: bool = option(False, "let segmentation, hypotheses and slam see past fused poses", level="basic")
+    enabled: bool = option(True, "let segmentation, hypotheses and slam see past fused poses", level="basic")
     delay_frames: int = option(
         4,
         "age of the youngest fused pose that they may see; at least graph.credits_replay",

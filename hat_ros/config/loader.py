@@ -7,16 +7,47 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import types
+import re
 import typing
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import yaml
 
+from hat_ros.config.option import Value
 from hat_ros.config.schema import HatConfig
 from hat_ros.errors import ConfigError
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+    Section = TypeVar("Section", bound=DataclassInstance)
+
+BASE_KEY = "base"
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML without two of its traps: the second of two equal keys wins silently, and ``1e-3`` is a word."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """See the base class.
+
+        Raises:
+            ConstructorError: a key stands twice.
+        """
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"key '{key.value}' stands twice", key.start_mark)
+            seen.add(key.value if isinstance(key, yaml.ScalarNode) else key)
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
+)
 
 
 def preset_folder() -> Path:
@@ -29,27 +60,85 @@ def preset_names() -> list[str]:
     return sorted(path.stem for path in preset_folder().glob("*.yaml"))
 
 
-def load_config(name_or_file: str | Path = "default", overrides: typing.Sequence[str] = ()) -> HatConfig:
+def load_config(name_or_file: str | Path = "default", overrides: Sequence[str] = ()) -> HatConfig:
     """Read a preset by name or a YAML file, then apply ``section.key=value`` overrides (values are YAML).
 
+    What a file does not state is as in the preset that its key ``base`` names, else as in ``default``.
+
     Raises:
-        ConfigError: no such preset or file, not a mapping, unknown key, wrong type, value out of range.
+        ConfigError: no such preset or file, not a mapping, unknown or repeated key, wrong type, value out of range.
     """
-    text = str(name_or_file)
-    path = Path(text) if text.endswith((".yaml", ".yml")) else preset_folder() / f"{text}.yaml"
-    if not path.is_file():
-        raise ConfigError(f"no configuration '{text}': presets are {', '.join(preset_names())}, or give a .yaml file")
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
-    if data is None:
-        data = {}
-    if not isinstance(data, dict):
-        raise ConfigError(f"{path}: the top level must be a mapping of sections, found {type(data).__name__}")
+    data = _read(str(name_or_file), ())
     for override in overrides:
         _apply_override(data, override)
     return config_from_dict(data)
+
+
+def config_from_dict(data: Mapping[str, Any]) -> HatConfig:
+    """Typed configuration from nested mappings; anything missing is as in the ``default`` preset.
+
+    Raises:
+        ConfigError: unknown key, wrong type, value out of range.
+    """
+    return _build(HatConfig, data, "")
+
+
+def config_to_dict(config: HatConfig) -> dict[str, Any]:
+    """Nested plain mappings, complete, in declaration order."""
+    return dataclasses.asdict(config)
+
+
+def flat_options(
+    section: DataclassInstance | None = None, prefix: str = ""
+) -> dict[str, tuple[Value, dataclasses.Field[Any]]]:
+    """Dotted name -> (value, field) of every parameter of a configuration or section, in declaration order.
+
+    The keys of ``field.metadata`` are the arguments of :func:`~hat_ros.config.option.option`: doc, level, symbol,
+    unit, low, high, choices. The nodes declare the names as ROS parameters. Without an argument: the default preset.
+    """
+    section = HatConfig() if section is None else section
+    out: dict[str, tuple[Value, dataclasses.Field[Any]]] = {}
+    for item in dataclasses.fields(section):
+        value = getattr(section, item.name)
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            out.update(flat_options(value, f"{prefix}{item.name}."))
+        else:
+            out[f"{prefix}{item.name}"] = (value, item)
+    return out
+
+
+def _read(name_or_file: str, readers: tuple[str, ...]) -> dict[str, Any]:
+    """What a preset or file states, on top of its base; ``readers`` are the presets that have it as their base."""
+    is_file = name_or_file.endswith((".yaml", ".yml"))
+    path = Path(name_or_file) if is_file else preset_folder() / f"{name_or_file}.yaml"
+    if not path.is_file():
+        known = ", ".join(preset_names())
+        raise ConfigError(f"no configuration '{name_or_file}': presets are {known}, or give a .yaml file")
+    try:
+        with path.open(encoding="utf-8") as stream:
+            data = yaml.load(stream, _Loader)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
+    if data is None:
+        return {}
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path}: the top level must be a mapping of sections, found {type(data).__name__}")
+    if BASE_KEY not in data:
+        return data
+    base = data.pop(BASE_KEY)
+    if base not in preset_names() or base in (*readers, name_or_file):
+        others = ", ".join(name for name in preset_names() if name not in (*readers, name_or_file))
+        raise ConfigError(f"{path}: {BASE_KEY} must be one of the presets {others}; found {base!r}")
+    return _merged(_read(base, (*readers, name_or_file)), data)
+
+
+def _merged(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """Nested mappings, the second on top of the first."""
+    out = dict(below)
+    for key, value in above.items():
+        both = isinstance(value, dict) and isinstance(out.get(key), dict)
+        out[key] = _merged(out[key], value) if both else value
+    return out
 
 
 def _apply_override(data: dict[str, Any], override: str) -> None:
@@ -63,40 +152,13 @@ def _apply_override(data: dict[str, Any], override: str) -> None:
         if not isinstance(node, dict):
             raise ConfigError(f"override '{override}': '{section}' is a value, not a section")
     try:
-        node[last] = yaml.safe_load(value)
+        node[last] = yaml.load(value, _Loader)
     except yaml.YAMLError:
         raise ConfigError(f"override '{override}': the value is not valid YAML") from None
 
 
-def config_from_dict(data: dict[str, Any]) -> HatConfig:
-    """Typed configuration from nested mappings; anything missing keeps its default.
-
-    Raises:
-        ConfigError: unknown key, wrong type, value out of range.
-    """
-    return _build(HatConfig, data, "")
-
-
-def config_to_dict(config: HatConfig) -> dict[str, Any]:
-    """Nested plain mappings, complete, in declaration order."""
-    return dataclasses.asdict(config)
-
-
-def flat_options(section: Any = None, prefix: str = "") -> dict[str, tuple[Any, dataclasses.Field[Any]]]:
-    """Dotted name -> (value, field) of every parameter; what the nodes declare as ROS parameters."""
-    section = HatConfig() if section is None else section
-    out: dict[str, tuple[Any, dataclasses.Field[Any]]] = {}
-    for item in dataclasses.fields(section):
-        value = getattr(section, item.name)
-        if dataclasses.is_dataclass(value):
-            out.update(flat_options(value, f"{prefix}{item.name}."))
-        else:
-            out[f"{prefix}{item.name}"] = (value, item)
-    return out
-
-
-def _build(cls: type, data: Any, prefix: str) -> Any:
-    if not isinstance(data, dict):
+def _build(cls: type[Section], data: object, prefix: str) -> Section:
+    if not isinstance(data, Mapping):
         raise ConfigError(f"{prefix.rstrip('.') or 'configuration'}: expected a mapping, found {data!r}")
     known = {item.name: item for item in dataclasses.fields(cls)}
     hints = typing.get_type_hints(cls)
@@ -113,22 +175,23 @@ def _build(cls: type, data: Any, prefix: str) -> Any:
     return cls(**values)
 
 
-def _check(name: str, value: Any, hint: Any, metadata: typing.Mapping[str, Any]) -> Any:
-    if isinstance(hint, types.UnionType):
-        if value is None and type(None) in hint.__args__:
-            return None
-        hint = next(arg for arg in hint.__args__ if arg is not type(None))
-    accepts = {float: (int, float), int: (int,), bool: (bool,), str: (str,)}[hint]
+def _check(name: str, value: object, hint: type, metadata: Mapping[str, Any]) -> Value:
+    """The value as the type that the schema promises.
+
+    Raises:
+        ConfigError: another type, not a number, out of range, or none of the choices.
+    """
+    accepts = (int, float) if hint is float else (hint,)
     if not isinstance(value, accepts) or (isinstance(value, bool) and hint is not bool):
         raise ConfigError(f"{name}: expected {hint.__name__}, found {value!r} ({type(value).__name__})")
-    value = hint(value)
-    low, high, choices = metadata.get("low"), metadata.get("high"), metadata.get("choices")
-    if hint is float and value != value:
+    checked: Value = hint(value)
+    low, high, choices = metadata["low"], metadata["high"], metadata["choices"]
+    if checked != checked:
         raise ConfigError(f"{name}: must be a number, found NaN")
-    if low is not None and value < low:
-        raise ConfigError(f"{name}: must be at least {low}, found {value}")
-    if high is not None and value > high:
-        raise ConfigError(f"{name}: must be at most {high}, found {value}")
-    if choices and value not in choices:
-        raise ConfigError(f"{name}: must be one of {', '.join(choices)}, found '{value}'")
-    return value
+    if low is not None and checked < low:
+        raise ConfigError(f"{name}: must be at least {low}, found {checked}")
+    if high is not None and checked > high:
+        raise ConfigError(f"{name}: must be at most {high}, found {checked}")
+    if choices and checked not in choices:
+        raise ConfigError(f"{name}: must be one of {', '.join(choices)}, found '{checked}'")
+    return checked

@@ -1,4 +1,4 @@
-"""Presets are complete, the published figures are in them, and mistakes are named."""
+"""Presets state what differs, the published figures are in them, and mistakes are named."""
 
 import dataclasses
 
@@ -32,43 +32,128 @@ def test_the_four_presets_exist():
     assert set(PRESETS) <= set(preset_names())
 
 
-@pytest.mark.parametrize("name", PRESETS)
-def test_a_preset_lists_every_key_and_no_other(name):
-    data = yaml.safe_load((preset_folder() / f"{name}.yaml").read_text())
-    assert set(_flat(data)) == set(flat_options())
+def _stated(name):
+    return yaml.safe_load((preset_folder() / f"{name}.yaml").read_text()) or {}
+
+
+def test_the_default_preset_is_the_configuration_as_constructed():
+    assert load_config("default") == load_config() == config_from_dict({}) == HatConfig()
+    assert _stated("default") == {}
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_every_key_of_a_preset_is_commented(name):
-    for line in (preset_folder() / f"{name}.yaml").read_text().splitlines():
-        assert not line.strip() or "#" in line, line
+def test_a_preset_states_only_what_differs_from_its_base(name):
+    base = {key: value for key, (value, _) in flat_options(load_config(_stated(name).get("base", "default"))).items()}
+    values = {key: value for key, (value, _) in flat_options(load_config(name)).items()}
+    stated = set(_flat(_stated(name))) - {"base"}
+    assert stated == {key for key in values if values[key] != base[key]}
 
 
-def test_shared_configurations_are_the_papers_table():
-    mega, pico = load_config("mega_hat"), load_config("pico_hat")
-    assert (mega.keyframes.gap_frames, pico.keyframes.gap_frames) == (4, 6)
-    assert (mega.hypotheses.max_candidates, pico.hypotheses.max_candidates) == (10, 5)
-    assert (mega.selector.score_scale, pico.selector.score_scale) == (3.0, 100.0)
-    assert mega.selector.motion_weight_per_deg == pico.selector.motion_weight_per_deg == 0.3
-    assert (mega.fusion.relative_weight, pico.fusion.relative_weight) == (0.002, 0.1)
-    assert (mega.fusion.gate_angle_deg, pico.fusion.gate_angle_deg) == (75.0, 30.0)
-    assert mega.fusion.warmup_observations == pico.fusion.warmup_observations == 4
-    assert mega.fusion.huber_delta_m == pico.fusion.huber_delta_m == 0.3
-    assert (mega.hypotheses.guard, pico.hypotheses.guard) == (False, True)
-    assert (mega.selector.running_gate, pico.selector.running_gate) == (False, True)
-    assert not (mega.prior.enabled or pico.prior.enabled or mega.refinement.enabled or pico.refinement.enabled)
-    assert not (mega.selector.size_weighting or pico.selector.size_weighting)
+# Every value of the published method, by what shares it; mega_hat_spark has what mega_hat has unless stated.
+SHARED = {
+    "keyframes.settled_factor": 1,
+    "segmentation.backend": "mask2former",
+    "hypotheses.megapose.refiner_iterations": 5,
+    "hypotheses.megapose.box_padding": 0.2,
+    "hypotheses.picopose.ransac_threshold_px": 2.0,
+    "hypotheses.picopose.ransac_iterations": 150,
+    "slam.backend": "droid",
+    "slam.masked": True,
+    "slam.droid.input_area_px": 196608,
+    "slam.droid.warmup_keyframes": 8,
+    "slam.droid.filter_threshold": 2.4,
+    "slam.droid.keyframe_threshold": 4.0,
+    "slam.droid.beta": 0.3,
+    "slam.droid.frontend_threshold": 16.0,
+    "slam.droid.frontend_window": 25,
+    "slam.droid.frontend_radius": 2,
+    "slam.droid.frontend_nms": 1,
+    "slam.droid.motion_damping": 0.0,
+    "slam.droid.readout_updates": 3,
+    "slam.droid.readout_depths": False,
+    "slam.droid.as_released": True,
+    "slam.droid.backend_threshold": 22.0,
+    "slam.droid.backend_radius": 2,
+    "slam.droid.backend_nms": 3,
+    "selector.motion_weight_per_deg": 0.3,
+    "selector.max_motion_penalty": 0.0,
+    "selector.max_turn_deg_per_frame": 0.0,
+    "selector.gate_neighbourhood_deg": 15.0,
+    "selector.gate_min_median_support": 2.0,
+    "selector.gate_max_override_share": 0.7,
+    "selector.size_ref_px": 500.0,
+    "selector.size_exponent": 2.0,
+    "selector.size_weight_min": 0.05,
+    "alignment.lever_m_per_rad": 1.0,
+    "alignment.min_observations": 3,
+    "alignment.refit_interval_frames": 10,
+    "alignment.rejection_factor": 3.0,
+    "alignment.first_rejection_rounds": 3,
+    "alignment.refit_rejection_rounds": 1,
+    "alignment.reset_anchors": 4,
+    "fusion.inertial_weight": 0.0,
+    "fusion.gate_weight": 0.05,
+    "fusion.huber_delta_m": 0.3,
+    "fusion.confidence_exponent": 1.0,
+    "refinement.enabled": False,
+    "prior.enabled": False,
+}
+MEGA_HAT = {
+    "keyframes.gap_frames": 4,
+    "hypotheses.backend": "megapose",
+    "hypotheses.max_candidates": 10,
+    "hypotheses.guard": False,
+    "selector.score_scale": 3.0,
+    "selector.warmup_keyframes": 3,
+    "selector.running_gate": False,
+    "selector.size_weighting": False,
+    "fusion.relative_weight": 0.002,
+    "fusion.gate_angle_deg": 75.0,
+    "fusion.loss": "huber",
+    "fusion.warmup_observations": 4,
+    "fusion.confidence": "uniform",
+    "fusion.gap_fill": "hold",
+}
+PUBLISHED = {
+    "mega_hat": MEGA_HAT,
+    "pico_hat": MEGA_HAT
+    | {
+        "keyframes.gap_frames": 6,
+        "hypotheses.backend": "picopose",
+        "hypotheses.max_candidates": 5,
+        "hypotheses.guard": True,
+        "selector.score_scale": 100.0,
+        "selector.running_gate": True,
+        "fusion.relative_weight": 0.1,
+        "fusion.gate_angle_deg": 30.0,
+    },
+    "mega_hat_spark": MEGA_HAT
+    | {
+        "keyframes.gap_frames": 10,
+        "selector.score_scale": 1.0,
+        "selector.warmup_keyframes": 5,
+        "selector.running_gate": True,
+        "selector.size_weighting": True,
+        "fusion.relative_weight": 0.1,
+        "fusion.loss": "linear",
+        "fusion.warmup_observations": 3,
+        "fusion.confidence": "detection_area",
+        "fusion.gap_fill": "rotate",
+    },
+}
 
 
-def test_the_spark_configuration_is_the_papers_sensitivity_section():
-    spark = load_config("mega_hat_spark")
-    assert (spark.keyframes.gap_frames, spark.hypotheses.max_candidates) == (10, 10)
-    assert (spark.selector.score_scale, spark.selector.warmup_keyframes) == (1.0, 5)
-    assert (spark.fusion.relative_weight, spark.fusion.gate_angle_deg) == (0.1, 75.0)
-    assert (spark.fusion.loss, spark.fusion.warmup_observations) == ("linear", 3)
-    assert (spark.fusion.confidence, spark.fusion.gap_fill) == ("detection_area", "rotate")
-    assert spark.selector.size_weighting
-    assert spark.selector.running_gate
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_a_published_configuration_does_not_move_with_the_defaults(name):
+    """Paper: Table "Shared temporal configurations", Sec. "Hyperparameter Sensitivity"; the authors' reference."""
+    values = {key: value for key, (value, _) in flat_options(load_config(name)).items()}
+    published = SHARED | PUBLISHED[name]
+    assert {key: values[key] for key in published} == published
+
+
+def test_every_option_of_the_level_paper_is_pinned():
+    levels = {key for key, (_, item) in flat_options().items() if item.metadata["level"] == "paper"}
+    assert levels <= set(SHARED | MEGA_HAT)
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -109,10 +194,54 @@ def test_yaml_that_is_no_configuration(text, tmp_path):
         load_config(path)
 
 
-def test_an_empty_file_means_defaults(tmp_path):
+@pytest.mark.parametrize("text", ["", "# nothing\n", "base: default\n"])
+def test_a_file_that_states_nothing_means_the_default_preset(text, tmp_path):
     path = tmp_path / "empty.yaml"
-    path.write_text("")
+    path.write_text(text)
     assert load_config(path) == HatConfig()
+
+
+def test_a_file_starts_from_the_preset_that_it_names(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("fusion: {relative_weight: 0.5}\n")
+    assert load_config(path) == load_config("default", ["fusion.relative_weight=0.5"])
+    path.write_text("base: mega_hat_spark\nfusion: {relative_weight: 0.5}\n")
+    assert load_config(path) == load_config("mega_hat_spark", ["fusion.relative_weight=0.5"])
+
+
+@pytest.mark.parametrize("base", ["nope", "mine.yaml", "3", "[mega_hat]"])
+def test_a_base_must_be_a_preset(base, tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"base: {base}\n")
+    with pytest.raises(ConfigError, match="base must be one of the presets default, mega_hat"):
+        load_config(path)
+
+
+def test_presets_based_on_each_other_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("hat_ros.config.loader.preset_folder", lambda: tmp_path)
+    for name, base in (("one", "two"), ("two", "one"), ("three", "three"), ("four", "default"), ("default", "four")):
+        (tmp_path / f"{name}.yaml").write_text(f"base: {base}\n")
+    for name in ("one", "two", "three", "four", "default"):
+        with pytest.raises(ConfigError, match="base must be one of the presets"):
+            load_config(name)
+
+
+@pytest.mark.parametrize(
+    "text", ["a: 1\na: 2\n", "fusion:\n  loss: huber\n  loss: linear\n", "fusion: {}\nfusion: {}\n"]
+)
+def test_a_key_that_stands_twice_is_an_error(text, tmp_path):
+    path = tmp_path / "twice.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=r"key '(a|loss|fusion)' stands twice .*twice\.yaml\", line [23]"):
+        load_config(path)
+
+
+@pytest.mark.parametrize("text", ["1e-3", "1E-3", "1.e-3", "+1e-03", "0.001", "1.0e-3"])
+def test_a_number_with_an_exponent_is_a_number(text, tmp_path):
+    path = tmp_path / "small.yaml"
+    path.write_text(f"fusion:\n  relative_weight: {text}\n")
+    assert load_config(path).fusion.relative_weight == 1e-3
+    assert load_config("default", [f"fusion.relative_weight={text}"]).fusion.relative_weight == 1e-3
 
 
 def test_an_unknown_preset_names_the_known_ones():

@@ -6,8 +6,12 @@ from hat_ros.config import KeyframeConfig
 from hat_ros.core.keyframes import KeyframeSchedule
 
 
+def _published(gap_frames):
+    return KeyframeSchedule(KeyframeConfig(gap_frames=gap_frames, settled_factor=1))
+
+
 def _keyframes(gap, detections):
-    schedule = KeyframeSchedule(KeyframeConfig(gap_frames=gap))
+    schedule = _published(gap)
     return [i for i, found in enumerate(detections) if schedule.update(found)]
 
 
@@ -23,7 +27,7 @@ def test_without_a_detection_the_opportunity_stays_open():
 
 
 def test_a_reset_makes_the_next_detection_an_opportunity():
-    schedule = KeyframeSchedule(KeyframeConfig(gap_frames=4))
+    schedule = _published(4)
     assert schedule.update(True)
     assert not schedule.update(True)
     schedule.reset()
@@ -53,18 +57,18 @@ def test_a_first_attempt_that_decided_nothing_is_soon_repeated():
     assert _asked(schedule, decided=False) == [0, 2, 8, 14]
     schedule.reset()
     assert _asked(schedule, decided=True) == [0, 6, 12, 18]
-    assert _asked(KeyframeSchedule(KeyframeConfig(gap_frames=6)), decided=False) == [0, 6, 12, 18]
+    assert _asked(_published(6), decided=False) == [0, 6, 12, 18]
 
 
 def test_health_changes_nothing_with_a_factor_of_one():
-    schedule = KeyframeSchedule(KeyframeConfig(gap_frames=4))
+    schedule = _published(4)
     assert [i for i in range(20) if schedule.update(True, True)] == list(range(0, 20, 4))
 
 
 def test_an_attempt_on_something_else_is_soon_repeated():
     schedule = KeyframeSchedule(KeyframeConfig(gap_frames=6, settled_factor=3))
     assert [i for i in range(20) if schedule.update(True, in_vain=i in (1, 2, 9, 10))] == [0, 2, 8, 10, 16]
-    schedule = KeyframeSchedule(KeyframeConfig(gap_frames=6))
+    schedule = _published(6)
     assert [i for i in range(20) if schedule.update(True, in_vain=i > 0)] == [0, 6, 12, 18]
 
 
@@ -77,5 +81,5 @@ def test_frames_left_out_count_and_unsettle_the_track():
 
 
 def test_frames_left_out_do_not_count_with_a_factor_of_one():
-    schedule = KeyframeSchedule(KeyframeConfig(gap_frames=4))
+    schedule = _published(4)
     assert [i for i in range(10) if schedule.update(True, n_missed=3)] == [0, 4, 8]

@@ -1,16 +1,18 @@
 """The decoder against enumeration of every path, and its invariances."""
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import pytest
 
-from hat_ros.config import SelectorConfig
+from hat_ros.config import load_config
 from hat_ros.core.selector import RunningGate, SelectorStage, motion_penalty, rotation_increment, scaled_score
 from hat_ros.geometry import lie
 from hat_ros.types import Candidates, Motion
 
-FREE = SelectorConfig(warmup_keyframes=1)
+# The published decoder, without its warm-up.
+FREE = replace(load_config("mega_hat").selector, warmup_keyframes=1)
 
 
 def _motion(R, epoch=0):
@@ -71,7 +73,7 @@ def test_the_recurrence_finds_what_enumerating_all_paths_finds(seed, dropped, mi
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_limited_penalty_is_still_the_best_of_all_paths(seed):
-    config = SelectorConfig(warmup_keyframes=1, max_motion_penalty=8.0)
+    config = replace(FREE, max_motion_penalty=8.0)
     keyframes = _keyframes(seed)
     expected = _best_endpoint_by_enumeration(keyframes, config)
     selection = _run(keyframes, config)[-1]
@@ -85,8 +87,8 @@ def test_an_orientation_missing_at_first_wins_once_evidence_exceeds_the_limit():
     still = _motion(np.eye(3))
     keyframes = [(Candidates(row[:1], np.zeros(1)), still)] * 3
     keyframes += [(Candidates(row, np.array([0.0, 1.5])), still)] * 8
-    limited = _run(keyframes, SelectorConfig(score_scale=1.0, max_motion_penalty=8.0))
-    published = _run(keyframes, SelectorConfig(score_scale=1.0))
+    limited = _run(keyframes, replace(FREE, score_scale=1.0, max_motion_penalty=8.0))
+    published = _run(keyframes, replace(FREE, score_scale=1.0))
     assert [s.selected for s in limited[3:]] == [0] * 5 + [1] * 3
     assert all(s.selected == 0 for s in published)
 
@@ -101,15 +103,15 @@ def test_where_motion_is_missing_no_history_is_forgotten():
     still, none = Candidates(_half_a_turn_apart(), np.array([5.0, 0.0])), Motion.none()
     later = Candidates(_half_a_turn_apart(), np.array([0.0, 3.0]))
     limit = {"score_scale": 1.0, "max_motion_penalty": 8.0}
-    assert [s.selected for s in _run([(still, none), (later, none)], SelectorConfig(**limit))] == [0, 1]
-    kept = _run([(still, none), (later, none)], SelectorConfig(**limit, max_turn_deg_per_frame=5.0))
+    assert [s.selected for s in _run([(still, none), (later, none)], replace(FREE, **limit))] == [0, 1]
+    kept = _run([(still, none), (later, none)], replace(FREE, **limit, max_turn_deg_per_frame=5.0))
     assert [s.selected for s in kept] == [0, 0]
     assert kept[1].path_score[1] == pytest.approx(-2.0)  # 5 less 3, as if the motion were known to be none
 
 
 @pytest.mark.parametrize(("n_frames", "penalty"), [(1, 0.3 * 25.0), (3, 0.3 * 15.0), (6, 0.0)])
 def test_a_turn_that_the_time_allows_costs_nothing_where_motion_is_missing(n_frames, penalty):
-    config = SelectorConfig(max_motion_penalty=8.0, max_turn_deg_per_frame=5.0)
+    config = replace(FREE, max_motion_penalty=8.0, max_turn_deg_per_frame=5.0)
     before, after = (Candidates(_half_a_turn_apart(turned)[:1], np.zeros(1)) for turned in (0.0, 30.0))
     one, none = np.array([0]), Motion.none()
     found = motion_penalty(before, one, none, after, one, none, n_frames, config)
@@ -117,7 +119,7 @@ def test_a_turn_that_the_time_allows_costs_nothing_where_motion_is_missing(n_fra
 
 
 def test_frames_without_candidates_count_as_time_gone_by():
-    config = SelectorConfig(score_scale=1.0, max_motion_penalty=8.0, max_turn_deg_per_frame=5.0)
+    config = replace(FREE, score_scale=1.0, max_motion_penalty=8.0, max_turn_deg_per_frame=5.0)
     before = Candidates(_half_a_turn_apart(), np.array([6.0, 0.0]))
     after = Candidates(_half_a_turn_apart(90.0), np.array([0.0, 1.0]))
     lead = []
@@ -181,7 +183,7 @@ def test_motion_overrules_appearance_and_keeps_the_rival_alive():
 
 def test_before_the_warm_up_is_over_the_best_appearance_is_the_anchor():
     keyframes = _keyframes(3, n=12)
-    stage = SelectorStage(SelectorConfig(warmup_keyframes=3))
+    stage = SelectorStage(replace(FREE, warmup_keyframes=3))
     for i, (candidates, motion) in enumerate(keyframes):
         selection = stage.update(candidates, motion)
         assert stage.accepted == (i >= 2)
@@ -206,7 +208,7 @@ def test_no_increment_no_penalty(gap):
 def test_a_keyframe_without_survivors_does_not_advance_the_decoder():
     keyframes = _keyframes(7, n=6)
     nothing = Candidates(keyframes[0][0].pose_rows, np.full(3, -np.inf))
-    stage, plain = SelectorStage(SelectorConfig()), SelectorStage(SelectorConfig())
+    stage, plain = SelectorStage(FREE), SelectorStage(FREE)
     for candidates, motion in keyframes:
         gap = stage.update(nothing, _motion(lie.so3_exp(np.array([1.0, 2.0, 3.0]))))
         assert (gap.selected, stage.accepted) == (-1, False)
@@ -231,7 +233,7 @@ def test_path_scores_stay_bounded_over_any_length():
     ("size_px", "weight"), [(500, 1.0), (250, 0.25), (1000, 1.0), (50, 0.05), (1, 0.05), (400, 0.64)]
 )
 def test_size_weight_is_the_papers(size_px, weight):
-    config = SelectorConfig(score_scale=2.0, size_weighting=True)
+    config = replace(FREE, score_scale=2.0, size_weighting=True)
     candidates = Candidates(np.zeros((2, 7)), np.array([0.5, -0.5]), np.array([10.0, 20, 10 + size_px, 20 + size_px]))
     np.testing.assert_allclose(scaled_score(candidates, config), [0.0, -2.0 * weight], atol=1e-12)
     unknown = Candidates(np.zeros((2, 7)), np.array([0.5, -0.5]))
@@ -239,7 +241,7 @@ def test_size_weight_is_the_papers(size_px, weight):
 
 
 class TestRunningGate:
-    CONFIG = SelectorConfig(warmup_keyframes=1, running_gate=True)
+    CONFIG = replace(FREE, running_gate=True)
 
     @staticmethod
     def _keyframe(turns_deg, scores):
@@ -290,11 +292,11 @@ class TestRunningGate:
 
 def test_reset_forgets_everything():
     keyframes = _keyframes(9, n=6)
-    stage = SelectorStage(SelectorConfig(running_gate=True))
+    stage = SelectorStage(replace(FREE, running_gate=True))
     for candidates, motion in keyframes:
         stage.update(candidates, motion)
     stage.reset()
-    fresh = _run(keyframes, SelectorConfig(running_gate=True))
+    fresh = _run(keyframes, replace(FREE, running_gate=True))
     for expected, (candidates, motion) in zip(fresh, keyframes, strict=True):
         selection = stage.update(candidates, motion)
         assert selection.selected == expected.selected

@@ -21,8 +21,11 @@ SETTINGS = {
     "segmentation": {"backend": "annotated"},
     "hypotheses": {"backend": "knowing"},
     "slam": {"backend": "knowing"},
-    "keyframes": {"gap_frames": 2},
+    "keyframes": {"gap_frames": 2, "settled_factor": 1},
+    "selector": {"score_scale": 3.0, "max_motion_penalty": 0.0, "max_turn_deg_per_frame": 0.0},
     "fusion": {"gate_angle_deg": 30.0},
+    "refinement": {"enabled": False},
+    "prior": {"enabled": False},
 }
 N = 24
 

@@ -1,5 +1,6 @@
 """The offline reference: the best path of all, the joint optimum of all, and better than causal."""
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -10,10 +11,12 @@ from temporal_scene import HALF_TURN, make_scene, preset, rotation_error_deg
 from hat_ros.bench.methods.pose_graph import PoseGraph
 from hat_ros.bench.methods.smoothing import backtrace, consistent, smooth_measured, solve_offline
 from hat_ros.bench.temporal import run_temporal
-from hat_ros.config import FusionConfig, SelectorConfig
+from hat_ros.config import FusionConfig, load_config
 from hat_ros.core.selector import motion_penalty, scaled_score
 from hat_ros.geometry import lie
 from hat_ros.types import Candidates, Motion
+
+PUBLISHED = load_config("mega_hat").selector
 
 
 def _recorded(scene, drop=False):
@@ -23,7 +26,7 @@ def _recorded(scene, drop=False):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_path_is_the_best_of_all_paths(seed):
-    config = SelectorConfig()
+    config = PUBLISHED
     scene = make_scene(20, k=3, seed=seed, noise_deg=20, rate_deg=6)
     candidates, motions = _recorded(scene)
     keys = [i for i, group in enumerate(candidates) if len(group)]
@@ -46,7 +49,7 @@ def test_the_gate_is_one_verdict_over_the_whole_sequence():
     candidates, motions = _recorded(scene)
     keys = np.flatnonzero(scene.observations.key)
     # Nobody supports anybody: the median count is one, so every keyframe takes its best appearance.
-    chosen = backtrace(candidates, motions, SelectorConfig(running_gate=True, gate_neighbourhood_deg=0.001))
+    chosen = backtrace(candidates, motions, replace(PUBLISHED, running_gate=True, gate_neighbourhood_deg=0.001))
     np.testing.assert_array_equal(chosen[keys], np.argmax(scene.observations.scores[keys], axis=1))
 
 
@@ -54,10 +57,10 @@ def test_keyframes_without_survivors_are_passed_over():
     scene = make_scene(40, k=3)
     candidates, motions = _recorded(scene)
     candidates[12] = Candidates(candidates[12].pose_rows, np.full(3, -np.inf))
-    chosen = backtrace(candidates, motions, SelectorConfig())
+    chosen = backtrace(candidates, motions, PUBLISHED)
     assert chosen[12] == -1
     assert (chosen[[0, 4, 8, 16, 20]] >= 0).all()
-    assert (backtrace([Candidates.none()] * 5, [Motion.none()] * 5, SelectorConfig()) == -1).all()
+    assert (backtrace([Candidates.none()] * 5, [Motion.none()] * 5, PUBLISHED) == -1).all()
 
 
 @pytest.mark.parametrize("name", ["mega_hat", "pico_hat", "mega_hat_spark"])
