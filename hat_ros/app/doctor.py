@@ -114,13 +114,13 @@ def _renderer() -> list[Finding]:
 
     from hat_ros.geometry import lie
     from hat_ros.target.model import target_from_scene
-    from hat_ros.target.rendering import create_renderer
+    from hat_ros.target.ray_renderer import RayRenderer
     from hat_ros.types import Camera
 
     target = target_from_scene(trimesh.Scene(trimesh.creation.box((1.0, 1.0, 1.0))), "cube")
     camera = Camera(np.array([[100.0, 0, 31.5], [0, 100.0, 31.5], [0, 0, 1]]), 64, 64)
     start = time.perf_counter()
-    mask = create_renderer("embree", target).render(lie.transform(np.eye(3), [0, 0, 4.0]), camera, color=False).mask
+    mask = RayRenderer(target).render(lie.transform(np.eye(3), [0, 0, 4.0]), camera, color=False).mask
     elapsed_ms = 1e3 * (time.perf_counter() - start)
     # A unit cube whose near face is 3.5 m away covers 100 / 3.5 pixels a side.
     side = np.sqrt(np.count_nonzero(mask))

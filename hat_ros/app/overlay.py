@@ -10,7 +10,8 @@ import numpy as np
 from hat_ros.array_types import Float, UInt8
 from hat_ros.geometry import lie
 from hat_ros.target.model import Target
-from hat_ros.target.rendering import Renderer, create_renderer
+from hat_ros.target.ray_renderer import RayRenderer
+from hat_ros.target.rendering import Renderer
 from hat_ros.types import Camera, TrackState
 
 # RGB.
@@ -31,7 +32,7 @@ class OverlayPainter:
 
     def __init__(self, target: Target, renderer: Renderer | None = None) -> None:
         self._target = target
-        self._renderer = renderer or create_renderer("embree", target)
+        self._renderer = renderer or RayRenderer(target)
 
     def paint(
         self,

@@ -54,7 +54,7 @@ def _add_import(commands: Commands) -> None:
         "or NAME/ for each",
     )
     parser.add_argument("--check", action="store_true", help="also write a picture of the CAD projected by the labels")
-    parser.add_argument("--renderer", choices=("embree", "pyrender"), default="embree", help="what draws that picture")
+    parser.add_argument("--renderer", choices=("rays", "pyrender"), default="rays", help="what draws that picture")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(command=_import)
 

@@ -19,7 +19,7 @@ from hat_ros.cache import cached_arrays
 from hat_ros.refinement.sunlight import brightness
 from hat_ros.refinement.view import Surfels, TargetViewer
 from hat_ros.target.contour import COL_NU, COL_NV, COL_U, COL_V, COL_WEIGHT, contour_table
-from hat_ros.target.embree import pixel_rays
+from hat_ros.target.rays import pixel_rays
 from hat_ros.target.view_bank import (
     CONTOUR_POINTS,
     MAX_RADIUS,

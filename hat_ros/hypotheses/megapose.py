@@ -8,14 +8,12 @@ refiner passes, K + 20 K renders (K re-scored, 4 views x 5 iterations x K), inst
 
 from __future__ import annotations
 
-import contextlib
 import logging
 from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
 import torch
-from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
 from hat_ros.array_types import Float, UInt8
@@ -115,11 +113,7 @@ class MegaPoseHypotheses:
 
     @cached_property
     def _hull(self) -> Tensor:
-        """Vertices that decide how far the target extends in any direction."""
-        points = self._target.vertices_m
-        with contextlib.suppress(QhullError):  # a flat model has no hull of its own
-            points = points[ConvexHull(points).vertices]
-        return self._megapose.runtime.tensor(points)
+        return self._megapose.runtime.tensor(self._target.hull_m)
 
     def _coarse_views(self, camera: Camera) -> Tensor:
         """(576, 6, 240, 320) uint8, kept until the camera changes and, between runs, in the cache folder."""
@@ -169,8 +163,7 @@ def crop_points(target: Target, runtime: Runtime) -> mp.CropPoints:
     """
     points = target.vertices_m
     if len(points) < _N_CROP_POINTS:
-        corners = points[target.faces]
-        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        corners, area = target.corners_m, target.face_areas_m2
         rng = np.random.default_rng(0)
         face = rng.choice(len(corners), _N_CROP_POINTS, p=area / area.sum())
         weights = rng.dirichlet(np.ones(3), _N_CROP_POINTS)

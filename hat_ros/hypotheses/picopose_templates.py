@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from hat_ros.array_types import Bool, Float, Float32, UInt8
 from hat_ros.geometry import lie
-from hat_ros.target.embree import EmbreeRenderer, pixel_rays
 from hat_ros.target.model import Target
 from hat_ros.target.network_views import NetworkViewRenderer
+from hat_ros.target.ray_renderer import RayRenderer
+from hat_ros.target.rays import pixel_rays
 from hat_ros.target.sphere import icosphere, look_at_origin
 from hat_ros.types import Camera
 
@@ -101,7 +102,7 @@ def template_poses(target: Target) -> Float:
 
 def render_templates(target: Target) -> Templates:
     """Render, crop and lift all views: a few seconds on one core."""
-    looks, shapes = NetworkViewRenderer(target), EmbreeRenderer(target)
+    looks, shapes = NetworkViewRenderer(target), RayRenderer(target)
     # Panda3D applies K with pixel centres at +0.5, ours lie at integers.
     K = TEMPLATE_K.copy()
     K[:2, 2] -= 0.5

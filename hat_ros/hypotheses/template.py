@@ -51,7 +51,7 @@ from hat_ros.refinement.sunlight import SunMatcher
 from hat_ros.refinement.view import TargetViewer
 from hat_ros.segmentation.glow import look_into_space
 from hat_ros.target.model import Target
-from hat_ros.target.rendering import create_renderer
+from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.target.symmetry import load_or_find_symmetries, turned
 from hat_ros.target.view_bank import ViewBank, load_or_build, without_thin_parts
 from hat_ros.types import Camera, Candidates, Detection, Frame, PosePrior
@@ -140,7 +140,7 @@ class TemplateHypotheses:
         self._finer_fitter = PoseFitter(self._viewer, _FINER * options.render_px, _CONTOUR_POINTS)
         self._sun = SunMatcher(self._viewer)
         self._lit_bank = load_or_build_lit(self._viewer, options.n_angles)
-        renderer = create_renderer("embree", target)
+        renderer = RayRenderer(target)
         self._bank = load_or_build(target, renderer, options.n_views, options.n_angles)
         self._body_bank = load_or_build(target, renderer, options.n_views, options.n_angles, thin_parts=False)
         self._near_symmetries = load_or_find_symmetries(target)

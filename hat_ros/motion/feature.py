@@ -16,8 +16,8 @@ from hat_ros.geometry import lie
 from hat_ros.motion.surface import SurfacePrior
 from hat_ros.motion.tracks import PointTracks, detect
 from hat_ros.motion.window import Window, rehearse
-from hat_ros.target.embree import RayCaster
 from hat_ros.target.model import Target
+from hat_ros.target.rays import ray_caster
 from hat_ros.types import Camera, Detection, Frame, Motion, PosePrior
 
 # Points needed to start, and points that must agree with a new pose.
@@ -52,7 +52,7 @@ class FeatureSlam:
         self._delay_frames = config.prior.delay_frames
         # In a whole scene the target is a small part: its surface would say little, and pull at everything.
         self._target = target if config.slam.feature.use_prior and self._masked else None
-        self._caster = None if self._target is None else RayCaster(self._target)
+        self._caster = None if self._target is None else ray_caster(self._target)
         self._epoch = 0
         self._camera: Camera | None = None
         self._forget()

@@ -17,7 +17,7 @@ from hat_ros.config import FeatureSlamConfig
 from hat_ros.geometry import lie
 from hat_ros.geometry.linear import robust_mean_rotation
 from hat_ros.motion.window import Window
-from hat_ros.target.embree import RayCaster
+from hat_ros.target.rays import RayCaster
 from hat_ros.types import PosePrior
 
 # Depth is sampled here, px: the spread over the cross is what a misplaced silhouette or edge could cost.
@@ -95,8 +95,8 @@ class SurfacePrior:
         rays = np.concatenate([uv, np.ones((*uv.shape[:2], 1))], axis=-1).reshape(-1, 3) @ T_cam_target[:3, :3]
         origin = -T_cam_target[:3, 3] @ T_cam_target[:3, :3]
         hits = self._caster.trace(np.broadcast_to(origin, rays.shape), rays)
-        z = hits["tfar"].astype(np.float64).reshape(-1, len(_CROSS_PX))
-        hit = (hits["primID"] >= 0).reshape(z.shape)
+        z = hits.distance.astype(np.float64).reshape(-1, len(_CROSS_PX))
+        hit = (hits.face >= 0).reshape(z.shape)
         spread = np.where(hit, z, -np.inf).max(axis=1) - np.where(hit, z, np.inf).min(axis=1)
         known = hit[:, 0] & (np.count_nonzero(hit, axis=1) >= _MIN_HITS)
         return np.where(known, z[:, 0], np.nan), self._sigma_m + 0.5 * np.where(known, spread, 0.0)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 
 from hat_ros.array_types import Bool, Float, Float32, UInt8
 from hat_ros.geometry import lie
@@ -22,9 +21,9 @@ from hat_ros.target.contour import (
     COL_WEIGHT,
     contour_table,
 )
-from hat_ros.target.embree import RayCaster
 from hat_ros.target.model import Target
-from hat_ros.target.outline import Hits, Outlined, Rays, cast_outlined
+from hat_ros.target.outline import Outlined, Rays, cast_outlined
+from hat_ros.target.rays import Hits, ray_caster
 from hat_ros.types import Camera
 
 # Margin of the rendered crop around the target, in crop pixels: the contour needs background on both sides.
@@ -88,15 +87,9 @@ class TargetViewer:
 
     def __init__(self, target: Target) -> None:
         self.target = target
-        self._caster = RayCaster(target)
-        corners = target.vertices_m[target.faces]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        self._normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
+        self._caster = ray_caster(target)
+        self._normals = target.face_normals.astype(np.float32)
         self._shadow_start_m = np.float32(_SHADOW_START * target.bounding_radius_m)
-        try:
-            self._hull_m = target.vertices_m[ConvexHull(target.vertices_m).vertices]
-        except QhullError:  # a flat model
-            self._hull_m = target.vertices_m
 
     def made_up(self, side_px: int) -> tuple[Camera, Float]:
         """Square camera and a (4, 4) pose at which it sees the whole target, to rehearse with."""
@@ -134,7 +127,7 @@ class TargetViewer:
         crop = Camera(K, width + width % 2, height + height % 2)
         R, t = T_cam_target[:3, :3], T_cam_target[:3, 3]
         to_ray = np.ascontiguousarray((R.T @ np.linalg.inv(crop.K)).T)  # rays in the target frame: affine in the pixel
-        seen = cast_outlined(self._caster.trace, crop.width, crop.height, to_ray, -t @ R)
+        seen = cast_outlined(self._caster, crop.width, crop.height, to_ray, -t @ R)
         view = View(seen.mask, seen.depth_m, crop, origin, scale, T_cam_target, seen)
         return view if to_sun_cam is None else self.in_sunlight(view, to_sun_cam)
 
@@ -150,7 +143,7 @@ class TargetViewer:
     def bounds(self, T_cam_target: Float, camera: Camera) -> Float | None:
         """Image box (x0, y0, x1, y1) around the target, None when it is not in front of the camera."""
         R, t = np.ascontiguousarray(T_cam_target[:3, :3]), np.ascontiguousarray(T_cam_target[:3, 3])
-        return image_box(self._hull_m, R, t, camera.K, 1e-3 * self.target.bounding_radius_m)
+        return image_box(self.target.hull_m, R, t, camera.K, 1e-3 * self.target.bounding_radius_m)
 
     def surface(self, directions: Float, origin_m: Float) -> Surfels:
         """What rays (N, 3) from one point see, in the target frame."""
@@ -162,21 +155,20 @@ class TargetViewer:
     def surfels(self, view: View, rays: NDArray[np.intp]) -> Surfels:
         """What some of a view's grid of rays see: (N,) which, row by row of every second pixel of the crop."""
         (origins, directions), hits = view.seen.grid
-        chosen = {name: hits[name][rays] for name in ("primID", "u", "v", "tfar")}
-        return self._surfels((origins[rays], directions[rays]), chosen)
+        return self._surfels((origins[rays], directions[rays]), hits.taken(rays))
 
     def _surfels(self, rays: Rays, hits: Hits) -> Surfels:
         origins, directions = rays
-        at, points = hit_points(origins, directions, hits["primID"], hits["tfar"])
-        face_id, u, v = hits["primID"][at], hits["u"][at], hits["v"][at]
-        rgb = self.target.surface.sample(face_id, np.stack([1.0 - u - v, u, v], axis=-1), self.target.face_rgb)
-        return Surfels(at, points, normals_towards(directions[at], face_id, self._normals), rgb)
+        at, points = hit_points(origins, directions, hits.face, hits.distance)
+        hit = hits.taken(at)
+        rgb = self.target.surface.sample(hit.face, hit.barycentric, self.target.face_rgb)
+        return Surfels(at, points, normals_towards(directions[at], hit.face, self._normals), rgb)
 
     def _sunlit_hits(self, rays: Rays, hits: Hits, to_sun: Float32) -> Bool:
         """Which of the rays (N,) hit something that the sun shines on."""
         origins, directions = rays
-        at, points = hit_points(origins, directions, hits["primID"], hits["tfar"])
-        normals = normals_towards(directions[at], hits["primID"][at], self._normals)
+        at, points = hit_points(origins, directions, hits.face, hits.distance)
+        normals = normals_towards(directions[at], hits.face[at], self._normals)
         lit = np.zeros(len(directions), np.bool_)
         lit[at] = self.sunlit(points, normals, to_sun) > 0
         return lit

@@ -19,8 +19,8 @@ from hat_ros.segmentation.lit import LitBody
 from hat_ros.segmentation.masks import Mask, enlarge
 from hat_ros.segmentation.shape import SilhouetteBank
 from hat_ros.segmentation.textured import TexturedBackground
-from hat_ros.target.embree import EmbreeRenderer
 from hat_ros.target.model import Target
+from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.types import Detection, Frame, PosePrior
 
 _LEAP = 0.6  # share of the last overlap with a sure silhouette below which a mask is not believed ...
@@ -38,7 +38,7 @@ class ClassicalSegmenter:
 
     def __init__(self, config: HatConfig, target: Target) -> None:
         self._config = config.segmentation.classical
-        self._renderer = EmbreeRenderer(target)
+        self._renderer = RayRenderer(target)
         # What is lit is seldom a whole silhouette, and is compared in every frame: there the coarse bank does.
         self._lit = LitBody(self._config, SilhouetteBank(target, self._renderer, subdivisions=2))
         self._textured = TexturedBackground(self._config, SilhouetteBank(target, self._renderer))

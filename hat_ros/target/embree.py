@@ -1,8 +1,4 @@
-"""Ray casting on the CPU with Intel Embree (the ``embreex`` wheel): no GL, and the same bytes every time.
-
-One ray through each pixel centre, with camera z = 1, so that the ray parameter of a hit is its depth. Only pixels
-within the projected bounds of the convex hull are cast.
-"""
+"""Ray casting with Intel Embree (the ``embreex`` wheel): no GL, and the same bytes every time."""
 
 from __future__ import annotations
 
@@ -10,147 +6,38 @@ import numpy as np
 from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 
-from hat_ros.array_types import Bool, Float, Float32, Int32
-from hat_ros.target.model import Target
-from hat_ros.target.outline import cast_outlined
-from hat_ros.target.rendering import Rendering
-from hat_ros.types import Camera
+from hat_ros.array_types import Bool, Float
+from hat_ros.target.rays import Hits
 
 
-class RayCaster:
-    """Nearest hits and visibility for bundles of rays against one target, in the target frame."""
+class EmbreeCaster:
+    """See :class:`hat_ros.target.rays.RayCaster`.
 
-    def __init__(self, target: Target) -> None:
-        corners = np.ascontiguousarray(target.vertices_m[target.faces], dtype=np.float32)
+    Args:
+        corners_m: (F, 3, 3) corners of the triangles.
+    """
+
+    def __init__(self, corners_m: Float) -> None:
         self._scene = rtcore_scene.EmbreeScene()
-        TriangleMesh(self._scene, corners)
+        TriangleMesh(self._scene, np.ascontiguousarray(corners_m, dtype=np.float32))
+        # The first rays make Embree build its tree: here, where no other thread can cast any yet.
+        self.trace(np.zeros((1, 3)), np.ones((1, 3)))
 
-    def cast(self, origins_m: NDArray[np.floating], directions: NDArray[np.floating]) -> tuple[Int32, Float32, Float32]:
-        """Nearest hits: (N, 3), (N, 3) -> face (N,) or -1, ray parameter (N,), barycentric weights (N, 3)."""
-        hits = self.trace(origins_m, directions)
-        u, v = hits["u"], hits["v"]
-        return hits["primID"], hits["tfar"], np.stack([1.0 - u - v, u, v], axis=-1)
-
-    def trace(self, origins_m: NDArray[np.floating], directions: NDArray[np.floating]) -> dict[str, NDArray]:
-        """Embree's own record of the nearest hits: ``primID`` (-1 = miss), ``tfar``, ``u``, ``v`` of N rays."""
-        return self._scene.run(
+    def trace(self, origins_m: NDArray[np.floating], directions: NDArray[np.floating]) -> Hits:
+        """See the protocol."""
+        hits = self._scene.run(
             np.ascontiguousarray(origins_m, dtype=np.float32),
             np.ascontiguousarray(directions, dtype=np.float32),
             output=True,
         )
+        return Hits(hits["primID"], hits["tfar"], hits["u"], hits["v"])
 
     def occluded(self, origins_m: NDArray[np.floating], directions: NDArray[np.floating]) -> Bool:
-        """Whether anything lies on each ray: (N, 3), (N, 3) -> (N,)."""
+        """See the protocol."""
         hits = self._scene.run(
             np.ascontiguousarray(origins_m, dtype=np.float32),
             np.ascontiguousarray(directions, dtype=np.float32),
             query="OCCLUDED",
         )
         return np.asarray(hits) != -1
-
-
-class EmbreeRenderer:
-    """See the module's text."""
-
-    def __init__(self, target: Target) -> None:
-        self._target = target
-        self.caster = RayCaster(target)
-        corners = target.vertices_m[target.faces]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        self.face_normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-        self._face_normals32 = self.face_normals.astype(np.float32)
-        try:
-            self._hull_m = target.vertices_m[ConvexHull(target.vertices_m).vertices]
-        except QhullError:  # a flat model
-            self._hull_m = target.vertices_m
-
-    def render(self, T_cam_target: Float, camera: Camera, color: bool = True) -> Rendering:
-        """See :meth:`hat_ros.target.rendering.Renderer.render`."""
-        shape = (camera.height, camera.width)
-        depth = np.zeros(shape, np.float32)
-        normal = np.zeros((*shape, 3), np.float32)
-        face_id = np.full(shape, -1, np.int32)
-        rgb = np.zeros((*shape, 3), np.uint8)
-        x0, y0, x1, y1 = self.pixel_bounds(T_cam_target, camera)
-        if x0 >= x1 or y0 >= y1:
-            return Rendering(depth, normal, face_id, rgb)
-
-        R = T_cam_target[:3, :3]
-        directions, hits = self._cast(T_cam_target, camera, (x0, y0, x1, y1))
-        face = hits["primID"]
-        hit = np.flatnonzero(face >= 0)
-        rows, cols = np.divmod(hit, x1 - x0)
-        at = (rows + y0) * camera.width + (cols + x0)
-        face = face[hit]
-        n = self._face_normals32[face]
-        away = np.einsum("nk,nk->n", n, directions[hit]) > 0
-        n[away] *= np.float32(-1)
-        depth.reshape(-1)[at] = hits["tfar"][hit]
-        normal.reshape(-1, 3)[at] = n @ R.T.astype(np.float32)
-        face_id.reshape(-1)[at] = face
-        if color:
-            u, v = hits["u"][hit], hits["v"][hit]
-            barycentric = np.stack([1.0 - u - v, u, v], axis=-1)
-            rgb.reshape(-1, 3)[at] = self._target.surface.sample(face, barycentric, self._target.face_rgb)
-        return Rendering(depth, normal, face_id, rgb)
-
-    def silhouette(self, T_cam_target: Float, camera: Camera) -> Bool:
-        """The mask alone, (H, W); cheaper than :meth:`render`."""
-        mask = np.zeros((camera.height, camera.width), np.bool_)
-        x0, y0, x1, y1 = self.pixel_bounds(T_cam_target, camera)
-        if x0 < x1 and y0 < y1:
-            _, hits = self._cast(T_cam_target, camera, (x0, y0, x1, y1))
-            mask[y0:y1, x0:x1] = (hits["primID"] >= 0).reshape(y1 - y0, x1 - x0)
-        return mask
-
-    def outlined(self, T_cam_target: Float, camera: Camera) -> Bool:
-        """The mask like :meth:`silhouette` in half the time; specks may be lost."""
-        mask = np.zeros((camera.height, camera.width), np.bool_)
-        x0, y0, x1, y1 = self.pixel_bounds(T_cam_target, camera)
-        if x0 >= x1 or y0 >= y1:
-            return mask
-        R, t = T_cam_target[:3, :3], T_cam_target[:3, 3]
-        K = camera.K.copy()
-        K[:2, 2] -= x0, y0
-        to_ray, origin = np.ascontiguousarray((R.T @ np.linalg.inv(K)).T), -t @ R
-        width, height = x1 - x0 + (x1 - x0) % 2, y1 - y0 + (y1 - y0) % 2
-        part = cast_outlined(self.caster.trace, width, height, to_ray, origin).mask
-        mask[y0:y1, x0:x1] = part[: y1 - y0, : x1 - x0]
-        return mask
-
-    def _cast(
-        self, T_cam_target: Float, camera: Camera, bounds: tuple[int, int, int, int]
-    ) -> tuple[Float32, dict[str, NDArray]]:
-        """Directions in the target frame (N, 3), and hits, of the rays through a half-open box of pixels, by rows."""
-        R, t = T_cam_target[:3, :3], T_cam_target[:3, 3]
-        x0, y0, x1, y1 = bounds
-        # Rays in the target frame are affine in (u, v): no per-pixel matrix product.
-        to_ray = R.T @ np.linalg.inv(camera.K)
-        across = np.arange(x0, x1)[:, None] * to_ray[:, 0]
-        down = np.arange(y0, y1)[:, None] * to_ray[:, 1] + to_ray[:, 2]
-        directions = np.add(down[:, None], across[None], dtype=np.float32, casting="same_kind").reshape(-1, 3)
-        origins = np.empty_like(directions)
-        origins[:] = -t @ R
-        return directions, self.caster.trace(origins, directions)
-
-    def pixel_bounds(self, T_cam_target: Float, camera: Camera) -> tuple[int, int, int, int]:
-        """Half-open pixel range that can see the target: x0, y0, x1, y1."""
-        points = self._hull_m @ T_cam_target[:3, :3].T + T_cam_target[:3, 3]
-        if points[:, 2].max() <= 0:
-            return 0, 0, 0, 0
-        if points[:, 2].min() <= 1e-6:  # the camera is beside or inside: no finite bounds
-            return 0, 0, camera.width, camera.height
-        uv = camera.project(points)
-        size = np.array([camera.width, camera.height])
-        low = np.clip(np.floor(uv.min(axis=0)), 0, size).astype(int)
-        high = np.clip(np.ceil(uv.max(axis=0)) + 1, 0, size).astype(int)
-        return int(low[0]), int(low[1]), int(high[0]), int(high[1])
-
-
-def pixel_rays(camera: Camera, u_px: NDArray[np.floating], v_px: NDArray[np.floating]) -> Float:
-    """Ray directions with z = 1 through a grid of image points: (U,), (V,) px -> (V, U, 3), camera frame."""
-    y = (np.asarray(v_px, dtype=np.float64) - camera.K[1, 2]) / camera.K[1, 1]
-    x = (np.asarray(u_px, dtype=np.float64)[None] - camera.K[0, 2] - camera.K[0, 1] * y[:, None]) / camera.K[0, 0]
-    return np.stack([x, np.broadcast_to(y[:, None], x.shape), np.ones_like(x)], axis=-1)

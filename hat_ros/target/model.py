@@ -6,7 +6,6 @@ y-up if it was modelled so. Poses ``T_cam_target`` refer to exactly this frame.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 from dataclasses import dataclass
 from functools import cached_property
@@ -109,12 +108,34 @@ class Target:
         """Radius of the sphere about :attr:`center_m` that holds the model."""
         return float(np.linalg.norm(self.vertices_m - self.center_m, axis=1).max())
 
+    @property
+    def corners_m(self) -> Float:
+        """(F, 3, 3) corners of the faces."""
+        return self.vertices_m[self.faces]
+
+    @cached_property
+    def face_normals(self) -> Float:
+        """(F, 3) unit normals, on the side from which the corners run counter-clockwise."""
+        normals = _twice_area_vectors(self.corners_m)
+        return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+    @cached_property
+    def face_areas_m2(self) -> Float:
+        """(F,) area of each face."""
+        return _face_areas(self.corners_m)
+
+    @cached_property
+    def hull_m(self) -> Float:
+        """(H, 3) vertices of the convex hull: they decide how far the target extends in any direction."""
+        try:
+            return self.vertices_m[ConvexHull(self.vertices_m).vertices]
+        except QhullError:  # a flat model has no hull of its own
+            return self.vertices_m
+
     @cached_property
     def diameter_m(self) -> float:
         """Largest distance between two vertices."""
-        points = self.vertices_m
-        with contextlib.suppress(QhullError):  # a flat model has no hull of its own
-            points = points[ConvexHull(points).vertices]
+        points = self.hull_m
         return max(float(cdist(points[i : i + 512], points).max()) for i in range(0, len(points), 512))
 
 
@@ -214,7 +235,7 @@ def _part(scene: trimesh.Scene, node: str, name: str) -> _Part | None:
 
 def _corner_normals(mesh: trimesh.Trimesh, corners: Float, faces: Int, linear: Float) -> Float32:
     """Unit (F, 3, 3) normals: the file's, or the faces' own where it brings none."""
-    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, None].repeat(3, axis=1)
+    flat = _twice_area_vectors(corners)[:, None].repeat(3, axis=1)
     normal = flat
     # trimesh would compute vertex normals on demand; only those read from the file are in its cache at this point.
     if "vertex_normals" in mesh._cache:
@@ -300,8 +321,13 @@ def srgb_from_linear(linear: NDArray[np.floating]) -> UInt8:
     return np.rint(255.0 * np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)).astype(np.uint8)
 
 
+def _twice_area_vectors(corners: Float) -> Float:
+    """(F, 3) normals of triangles (F, 3, 3), twice as long as their areas."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
 def _face_areas(corners: Float) -> Float:
-    return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return 0.5 * np.linalg.norm(_twice_area_vectors(corners), axis=1)
 
 
 def _check_extent(corners: Float, name: str, unit_scale: float) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -10,9 +9,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from hat_ros.array_types import Bool, Float, Float32, Int32
+from hat_ros.target.rays import Hits, RayCaster
 
+# Origins in metres and directions of N rays, (N, 3) each.
 Rays = tuple[Float32, Float32]
-Hits = dict[str, NDArray]
 
 
 class Outlined(NamedTuple):
@@ -34,20 +34,20 @@ class Outlined(NamedTuple):
     scattered: tuple[Rays, Hits]
 
 
-def cast_outlined(trace: Callable[..., Hits], width: int, height: int, to_ray: Float, origin: Float) -> Outlined:
+def cast_outlined(caster: RayCaster, width: int, height: int, to_ray: Float, origin: Float) -> Outlined:
     """Silhouette on a crop of even size with a third of the rays; a speck between the grid's rays is lost.
 
     Args:
-        trace: casts rays, see :meth:`hat_ros.target.embree.RayCaster.trace`.
+        caster: of the target.
         width, height: of the crop, pixels.
         to_ray, origin: see :func:`grid_rays`.
     """
     rays = grid_rays(width, height, to_ray, origin)
-    hits = trace(*rays)
-    mask, depth_m, x, y = spread_grid(hits["primID"], hits["tfar"], width, height)
+    hits = caster.trace(*rays)
+    mask, depth_m, x, y = spread_grid(hits.face, hits.distance, width, height)
     near = scattered_rays(x, y, to_ray, origin)
-    near_hits = trace(*near)
-    place_pixels(mask, depth_m, x, y, near_hits["primID"], near_hits["tfar"])
+    near_hits = caster.trace(*near)
+    place_pixels(mask, depth_m, x, y, near_hits.face, near_hits.distance)
     return Outlined(mask, depth_m, (rays, hits), x, y, (near, near_hits))
 
 

@@ -16,8 +16,8 @@ from PIL import Image
 
 from hat_ros.array_types import Float
 from hat_ros.errors import MissingDependencyError
-from hat_ros.target.embree import EmbreeRenderer
 from hat_ros.target.model import Target
+from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.target.rendering import Rendering
 from hat_ros.types import Camera
 
@@ -35,7 +35,7 @@ class PyrenderRenderer:
     def __init__(self, target: Target) -> None:
         self._gl = _import_pyrender()
         self._target = target
-        self._rays = EmbreeRenderer(target)
+        self._rays = RayRenderer(target)
         self._scene = self._gl.Scene(bg_color=np.zeros(4), ambient_light=np.ones(3))
         for mesh in _meshes(target):
             self._scene.add(self._gl.Mesh.from_trimesh(mesh, smooth=False))
@@ -106,7 +106,7 @@ def _import_pyrender() -> Any:
     except (ImportError, AttributeError, OSError) as error:
         raise MissingDependencyError(
             f"renderer 'pyrender' cannot be loaded ({error}): run `pip install 'hat_ros[gl]'` and install EGL "
-            f"(`apt install libegl1`), or use the renderer 'embree', which needs neither"
+            f"(`apt install libegl1`), or use the renderer 'rays', which needs neither"
         ) from None
     return pyrender
 
@@ -117,5 +117,5 @@ def _canvas(gl: Any, camera: Camera) -> Any:
     except Exception as error:  # PyOpenGL raises what the driver makes of it
         raise MissingDependencyError(
             f"renderer 'pyrender' got no OpenGL context from EGL ({type(error).__name__}: {error}): install a driver "
-            f"(`apt install libegl1 libgl1-mesa-dri`), or use the renderer 'embree'"
+            f"(`apt install libegl1 libgl1-mesa-dri`), or use the renderer 'rays'"
         ) from None

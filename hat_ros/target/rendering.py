@@ -53,13 +53,13 @@ class Renderer(Protocol):
 
 
 RENDERERS = {
-    "embree": "hat_ros.target.embree:EmbreeRenderer",
+    "rays": "hat_ros.target.ray_renderer:RayRenderer",
     "pyrender": "hat_ros.target.pyrender:PyrenderRenderer",
 }
 
 
 def create_renderer(name: str, target: Target) -> Renderer:
-    """Build a renderer: ``embree`` (no GL, deterministic) or ``pyrender`` (EGL, extra ``gl``).
+    """Build a renderer: ``rays`` (no GL, deterministic) or ``pyrender`` (EGL, extra ``gl``).
 
     Raises:
         ConfigError: unknown name.

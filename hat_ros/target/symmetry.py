@@ -15,8 +15,8 @@ from hat_ros.array_types import Float, UInt8
 from hat_ros.cache import cached_arrays
 from hat_ros.geometry import lie
 from hat_ros.geometry.masks import overlap
-from hat_ros.target.embree import EmbreeRenderer
 from hat_ros.target.model import Target
+from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.target.view_bank import view_rotations
 from hat_ros.types import Camera
 
@@ -42,7 +42,7 @@ def near_symmetries(target: Target) -> Float:
 
     Quarter, third and half turns about the axes of the file and about the principal axes of the surface.
     """
-    renderer = EmbreeRenderer(target)
+    renderer = RayRenderer(target)
     focal = 0.47 * _SIDE_PX * np.sqrt(_DISTANCE_RADII**2 - 1.0)
     middle = (_SIDE_PX - 1) / 2
     camera = Camera(np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]]), _SIDE_PX, _SIDE_PX)
@@ -67,9 +67,8 @@ def turned(T_cam_target: Float, turn: Float, center_m: Float) -> NDArray:
 
 def _turns(target: Target) -> Float:
     """(N, 3, 3) the turns of a cube, but for none, about both sets of axes."""
-    corners = target.vertices_m[target.faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    _, axes = np.linalg.eigh(np.cov(corners.reshape(-1, 3).T, aweights=np.repeat(area, 3)))
+    weights = np.repeat(target.face_areas_m2, 3)
+    _, axes = np.linalg.eigh(np.cov(target.corners_m.reshape(-1, 3).T, aweights=weights))
     kept = [np.eye(3)]
     for about in (np.eye(3), axes):
         for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):

@@ -5,13 +5,13 @@ from shape_scene import CAMERA, pose_errors, random_pose, spacecraft
 from hat_ros.geometry import lie
 from hat_ros.hypotheses.matching import cut_placements, distinct, match_shape, whole_placement
 from hat_ros.target import view_bank
-from hat_ros.target.rendering import create_renderer
+from hat_ros.target.ray_renderer import RayRenderer
 
 
 @pytest.fixture(scope="module")
 def scene():
     target = spacecraft()
-    renderer = create_renderer("embree", target)
+    renderer = RayRenderer(target)
     return target, renderer, view_bank.build(target, renderer, 642, 72)
 
 

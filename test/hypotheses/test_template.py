@@ -14,7 +14,7 @@ from hat_ros.hypotheses.stage import HypothesisStage
 from hat_ros.hypotheses.template import TemplateHypotheses
 from hat_ros.refinement.mask_field import MaskField
 from hat_ros.refinement.view import TargetViewer, contour_lines
-from hat_ros.target.rendering import create_renderer
+from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.types import Camera, Detection, Frame, PosePrior
 
 
@@ -207,7 +207,7 @@ def test_a_contour_on_the_outline_is_nearer_to_it_than_one_beside(target):
     T = random_pose(np.random.default_rng(0), target)
     view = viewer.view(T, CAMERA, 160)
     points_m = contour_lines(view, 96).points_m
-    field = MaskField(create_renderer("embree", target).render(T, CAMERA, color=False).mask)
+    field = MaskField(RayRenderer(target).render(T, CAMERA, color=False).mask)
     beside, gone = T.copy(), T.copy()
     beside[0, 3] += 0.05 * T[2, 3]
     gone[0, 3] += 10.0 * T[2, 3]

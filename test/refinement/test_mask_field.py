@@ -4,7 +4,7 @@ from shape_scene import CAMERA, random_pose, spacecraft
 
 from hat_ros.refinement.mask_field import MaskField
 from hat_ros.refinement.view import TargetViewer
-from hat_ros.target.rendering import create_renderer
+from hat_ros.target.ray_renderer import RayRenderer
 
 BLACK = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
 
@@ -16,7 +16,7 @@ def viewer():
 
 def test_the_true_pose_overlaps_its_own_mask(viewer):
     T = random_pose(np.random.default_rng(2), viewer.target)
-    mask = create_renderer("embree", viewer.target).render(T, CAMERA, color=False).mask
+    mask = RayRenderer(viewer.target).render(T, CAMERA, color=False).mask
     field = MaskField(mask)
     areas = field.compare(viewer.view(T, CAMERA, 160), BLACK)
     assert areas.union_share > 0.96
@@ -27,7 +27,7 @@ def test_the_true_pose_overlaps_its_own_mask(viewer):
 def test_what_lies_outside_the_image_counts_nowhere(viewer):
     T = random_pose(np.random.default_rng(2), viewer.target, range_m=(5.0, 5.2))
     T[0, 3] += 1.3
-    mask = create_renderer("embree", viewer.target).render(T, CAMERA, color=False).mask
+    mask = RayRenderer(viewer.target).render(T, CAMERA, color=False).mask
     assert mask[:, -1].any()
     assert MaskField(mask).compare(viewer.view(T, CAMERA, 160), BLACK).union_share > 0.95
 

@@ -8,7 +8,7 @@ from hat_ros.refinement.mask_field import MaskField
 from hat_ros.refinement.pose_fitter import PoseFitter
 from hat_ros.refinement.view import TargetViewer
 from hat_ros.target.outline import spread_grid
-from hat_ros.target.rendering import create_renderer
+from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.types import Camera
 
 BLACK = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
@@ -23,14 +23,14 @@ def viewer():
 def test_the_silhouette_is_that_of_the_renderer(viewer, seed):
     T = random_pose(np.random.default_rng(seed), viewer.target)
     view = viewer.view(T, CAMERA, 160)
-    full = create_renderer("embree", viewer.target).render(T, view.camera, color=False)
+    full = RayRenderer(viewer.target).render(T, view.camera, color=False)
     assert np.count_nonzero(view.mask != full.mask) <= 0.002 * np.count_nonzero(full.mask)
 
 
 @pytest.mark.parametrize("shift_px", [(30, -20), (-60, 10)])
 def test_centring_finds_a_target_that_has_drifted(viewer, shift_px):
     T_true = random_pose(np.random.default_rng(6), viewer.target)
-    field = MaskField(create_renderer("embree", viewer.target).render(T_true, CAMERA, color=False).mask)
+    field = MaskField(RayRenderer(viewer.target).render(T_true, CAMERA, color=False).mask)
     start = T_true.copy()
     start[:2, 3] += np.array(shift_px) * T_true[2, 3] / CAMERA.K[0, 0]
     centred = PoseFitter(viewer, 160, 300).centred(start, CAMERA, field, BLACK)

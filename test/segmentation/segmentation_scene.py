@@ -8,7 +8,7 @@ import trimesh
 
 from hat_ros.geometry import lie
 from hat_ros.target.model import target_from_scene
-from hat_ros.target.rendering import create_renderer
+from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.types import Camera, Frame, PosePrior
 
 WIDTH, HEIGHT = 320, 240
@@ -35,7 +35,7 @@ class Scene:
     seed: int = 0
 
     def __post_init__(self):
-        self.renderer = create_renderer("embree", self.target)
+        self.renderer = RayRenderer(self.target)
         self._passing = {}
         rng = np.random.default_rng(self.seed)
         ground = np.zeros((512, 512, 3), np.float32)

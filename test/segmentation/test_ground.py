@@ -10,7 +10,7 @@ from hat_ros.segmentation.region import tidy
 from hat_ros.segmentation.search import Search
 from hat_ros.segmentation.shape import SilhouetteBank
 from hat_ros.segmentation.stage import SegmentationStage
-from hat_ros.target.embree import EmbreeRenderer
+from hat_ros.target.ray_renderer import RayRenderer
 
 BOX = np.s_[90:150, 130:200]  # where the body stands
 LENGTH_PX = 70.0
@@ -99,7 +99,7 @@ def test_another_scene_is_a_new_start(scene):
 
 
 def test_a_target_longer_than_the_ground_has_moved_is_not_taken_for_found(lopsided, scene):
-    search = Search(HatConfig().segmentation.classical, SilhouetteBank(lopsided, EmbreeRenderer(lopsided)))
+    search = Search(HatConfig().segmentation.classical, SilhouetteBank(lopsided, RayRenderer(lopsided)))
     for i in range(5):
         rgb = picture(scene, shifted(i), seed=i)
         search.push(rgb)

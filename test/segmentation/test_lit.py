@@ -7,8 +7,8 @@ from hat_ros.config import ClassicalConfig
 from hat_ros.segmentation.lit import LitBody
 from hat_ros.segmentation.shape import SilhouetteBank
 from hat_ros.segmentation.sky import lit_regions, measure_sky
-from hat_ros.target.embree import EmbreeRenderer
 from hat_ros.target.model import target_from_scene
+from hat_ros.target.ray_renderer import RayRenderer
 
 
 def body_of(*boxes):
@@ -20,7 +20,7 @@ def body_of(*boxes):
         part.visual.face_colors = (180, 180, 180, 255)
         parts.append(part)
     target = target_from_scene(trimesh.Scene(parts), "boxes")
-    return LitBody(ClassicalConfig(), SilhouetteBank(target, EmbreeRenderer(target)))
+    return LitBody(ClassicalConfig(), SilhouetteBank(target, RayRenderer(target)))
 
 
 @pytest.fixture(scope="module")

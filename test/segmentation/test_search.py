@@ -6,12 +6,12 @@ from segmentation_scene import HEIGHT, WIDTH
 from hat_ros.config import HatConfig
 from hat_ros.segmentation.search import Search
 from hat_ros.segmentation.shape import SilhouetteBank
-from hat_ros.target.embree import EmbreeRenderer
+from hat_ros.target.ray_renderer import RayRenderer
 
 
 @pytest.fixture
 def search(lopsided):
-    return Search(HatConfig().segmentation.classical, SilhouetteBank(lopsided, EmbreeRenderer(lopsided)))
+    return Search(HatConfig().segmentation.classical, SilhouetteBank(lopsided, RayRenderer(lopsided)))
 
 
 def glances(search, scene, mask_of, frames=range(3, 9)):

@@ -3,12 +3,12 @@ import numpy as np
 import pytest
 
 from hat_ros.segmentation.shape import SilhouetteBank
-from hat_ros.target.rendering import create_renderer
+from hat_ros.target.ray_renderer import RayRenderer
 
 
 @pytest.fixture(scope="module")
 def bank(lopsided):
-    return SilhouetteBank(lopsided, create_renderer("embree", lopsided))
+    return SilhouetteBank(lopsided, RayRenderer(lopsided))
 
 
 def random_poses(scene, count):

@@ -12,8 +12,8 @@ import trimesh
 
 from hat_ros.config import DroidConfig, HatConfig, SlamConfig
 from hat_ros.geometry import lie
-from hat_ros.target.embree import EmbreeRenderer
 from hat_ros.target.model import target_from_scene
+from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.types import Camera, Detection, Frame
 
 STRIDE = 8
@@ -69,7 +69,7 @@ def make_clip(n_frames, width=256, height=192, focal=230.0, frame_ns=100_000_000
     K8 = camera.K / STRIDE
     K8[2, 2] = 1
     small = Camera(K8, width // STRIDE, height // STRIDE)
-    renderer = EmbreeRenderer(satellite())
+    renderer = RayRenderer(satellite())
     poses = tumbling_poses(n_frames, **motion)
     depth8 = np.stack([renderer.render(T, small, color=False).depth_m for T in poses])
     frames = [Frame((i + 1) * frame_ns, numbered_image(i, height, width), camera) for i in range(n_frames)]

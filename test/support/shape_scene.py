@@ -7,7 +7,7 @@ import trimesh
 from hat_ros.bench.synth.sunlit import Light, SunlitRenderer
 from hat_ros.geometry import lie
 from hat_ros.target.model import srgb_from_linear, target_from_scene
-from hat_ros.target.rendering import create_renderer
+from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.types import Camera, Frame
 
 CAMERA = Camera(np.array([[500.0, 0, 159.5], [0, 500.0, 119.5], [0, 0, 1]]), 320, 240)
@@ -36,7 +36,7 @@ def random_pose(rng, target, range_m=(6.0, 9.0), offset=0.06):
 
 def picture(target, T_cam_target, camera=CAMERA, background=0, stamp_ns=1):
     """A frame and the true mask: diffuse shading with a sun beside the camera, anti-aliased."""
-    renderer = create_renderer("embree", target)
+    renderer = RayRenderer(target)
     fine = Camera(
         np.array(
             [

@@ -7,8 +7,8 @@ import numpy as np
 import trimesh
 
 from hat_ros.geometry import lie
-from hat_ros.target.embree import EmbreeRenderer
 from hat_ros.target.model import target_from_scene
+from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.types import Camera, Detection, Frame, PosePrior
 
 CAMERA = Camera(np.array([[420.0, 0, 159.5], [0, 420.0, 119.5], [0, 0, 1]]), 320, 240)
@@ -78,7 +78,7 @@ def speckled_clip(n_frames, backdrop=False, wall=False, **motion):
     """Render a clip; ``backdrop`` adds a bright texture behind the target that moves on its own, ``wall`` one that is
     fixed to the target."""
     target, poses = model(), turning_poses(n_frames, **motion)
-    renderer, rng = EmbreeRenderer(target), np.random.default_rng(3)
+    renderer, rng = RayRenderer(target), np.random.default_rng(3)
     clouds = cv2.GaussianBlur(rng.uniform(0, 255, (600, 900)), (0, 0), 3)
     clouds = np.clip(128 + 12 * (clouds - clouds.mean()), 0, 255)
     frames, detections = [], []

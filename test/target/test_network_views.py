@@ -8,9 +8,9 @@ from scipy import ndimage
 
 from hat_ros.geometry import lie
 from hat_ros.target import network_views
-from hat_ros.target.embree import RayCaster, pixel_rays
 from hat_ros.target.model import target_from_scene
 from hat_ros.target.network_views import NetworkViewRenderer, encode_normal
+from hat_ros.target.rays import pixel_rays, ray_caster
 from hat_ros.types import Camera
 
 DATA = Path(__file__).parents[1] / "data"
@@ -87,9 +87,10 @@ def test_views_agree_with_ray_casting(seed):
     rgb = np.zeros((60, 80, 3))
     for du, dv in network_views._SAMPLES:
         rays = pixel_rays(Camera(K, 80, 60), np.arange(80) + du, np.arange(60) + dv).reshape(-1, 3) @ T[:3, :3]
-        face, _, weights = RayCaster(target).cast(np.broadcast_to(-T[:3, 3] @ T[:3, :3], rays.shape), rays)
-        hit = face >= 0
-        rgb.reshape(-1, 3)[hit] += target.surface.sample(face[hit], weights[hit], target.face_rgb) / 4
+        hits = ray_caster(target).trace(np.broadcast_to(-T[:3, 3] @ T[:3, :3], rays.shape), rays)
+        seen = hits.face >= 0
+        hit = hits.taken(seen)
+        rgb.reshape(-1, 3)[seen] += target.surface.sample(hit.face, hit.barycentric, target.face_rgb) / 4
     different = np.abs(view[..., :3] - rgb).max(axis=2) > 1.5
     assert view.any() and different.mean() < 2e-3, "only where a sample lies on an edge, of a face or a texel"
 

@@ -7,7 +7,7 @@ from hat_ros.cache import cache_folder
 from hat_ros.geometry import lie
 from hat_ros.target import view_bank
 from hat_ros.target.model import target_from_scene
-from hat_ros.target.rendering import create_renderer
+from hat_ros.target.ray_renderer import RayRenderer
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def test_views_cover_the_sphere_evenly(n_views):
 
 
 def test_a_damaged_cache_is_built_again(target):
-    renderer = create_renderer("embree", target)
+    renderer = RayRenderer(target)
     first = view_bank.load_or_build(target, renderer, 162, 24)
     spectrum = np.array(first.spectrum)
     file = next(cache_folder().rglob("spectrum.npy"))
@@ -47,11 +47,11 @@ def test_a_damaged_cache_is_built_again(target):
 def test_a_read_only_cache_is_no_error(target, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    assert view_bank.load_or_build(target, create_renderer("embree", target), 162, 24).area.shape == (162,)
+    assert view_bank.load_or_build(target, RayRenderer(target), 162, 24).area.shape == (162,)
 
 
 def test_contour_points_lie_on_the_target(target):
-    views = view_bank.build(target, create_renderer("embree", target), 162, 24)
+    views = view_bank.build(target, RayRenderer(target), 162, 24)
     used = views.contour_weight > 0
     points = views.contour_m[used]
     low, high = target.vertices_m.min(axis=0), target.vertices_m.max(axis=0)
@@ -122,7 +122,7 @@ def test_a_bank_without_thin_parts_describes_the_body_that_carries_them():
     body = trimesh.creation.box((1.0, 0.7, 0.5))
     boom = trimesh.creation.cylinder(0.013, 1.6, transform=lie.transform(np.eye(3), [0.0, 0.0, 0.8]))
     whole = target_from_scene(trimesh.Scene([body, boom]), "with a boom")
-    renderer = create_renderer("embree", whole)
+    renderer = RayRenderer(whole)
     with_boom, without = (view_bank.build(whole, renderer, 162, 24, thin_parts) for thin_parts in (True, False))
     on_boom = [
         np.where(views.contour_m[..., 2] > 0.6, views.contour_weight, 0.0).sum(axis=1) for views in (with_boom, without)

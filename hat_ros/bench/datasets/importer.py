@@ -82,7 +82,7 @@ def import_dataset(
     boxes: bool = False,
     detections: str | Path | None = None,
     check: bool = False,
-    renderer: str = "embree",
+    renderer: str = "rays",
     progress: Progress | None = None,
 ) -> list[Path]:
     """Write bags: ``out`` itself for the ``sequence`` format, ``out/NAME`` per sequence otherwise.
@@ -98,7 +98,7 @@ def import_dataset(
         detections: masks or boxes computed elsewhere instead of the data set's own, see :func:`with_detections`; a
             folder with ``NAME`` or ``NAME.json`` for each sequence, or what there is of the only one.
         check: also write ``NAME.check.png`` beside each bag, see :func:`check_picture`.
-        renderer: what draws it, see ``render.create_renderer``.
+        renderer: what draws it, see :func:`hat_ros.target.rendering.create_renderer`.
         progress: called with (sequence, frames done, frames in all).
 
     Returns:
@@ -258,7 +258,7 @@ def with_detections(recording: ImageRecording, path: Path) -> ImageRecording:
     return replace(recording, detections=lookup)
 
 
-def check_picture(recording: ImageRecording, width_px: int = 640, renderer_name: str = "embree") -> UInt8:
+def check_picture(recording: ImageRecording, width_px: int = 640, renderer_name: str = "rays") -> UInt8:
     """First, middle and last labelled frame over the CAD rendered at the true pose, outlined in green: (H, W, 3) RGB.
 
     Wrong units, quaternion order, frames or axes show at once: the outline misses the target. A mirrored or turned

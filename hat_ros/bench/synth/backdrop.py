@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from hat_ros.array_types import Bool, Float, Float32
-from hat_ros.target.embree import pixel_rays
+from hat_ros.target.rays import pixel_rays
 from hat_ros.types import Camera
 
 _EARTH_RADIUS_KM = 6371.0

@@ -14,8 +14,9 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from hat_ros.array_types import Float, Float32, Int32
-from hat_ros.target.embree import EmbreeRenderer, pixel_rays
 from hat_ros.target.model import Surface, Target, linear_from_srgb
+from hat_ros.target.ray_renderer import RayRenderer
+from hat_ros.target.rays import pixel_rays
 from hat_ros.types import Camera
 
 # Face normals closer than this are smoothed over, so that turned parts look round and box edges stay sharp.
@@ -53,7 +54,7 @@ class SunlitRenderer:
         self._target = target
         self._n = supersample
         self._gloss = np.float32(gloss)
-        self.plain = EmbreeRenderer(target)
+        self.plain = RayRenderer(target)
         self._normals = smoothed_normals(target)
         self._albedo = _MipSampler(target)
 
@@ -71,13 +72,15 @@ class SunlitRenderer:
         rays = pixel_rays(camera, u, v).reshape(-1, 3)
         R, t = T_cam_target[:3, :3], T_cam_target[:3, 3]
         directions, origin = (rays @ R).astype(np.float32), (-t @ R).astype(np.float32)
-        face, depth, barycentric = self.plain.caster.cast(np.broadcast_to(origin, directions.shape), directions)
-        hit = np.flatnonzero(face >= 0)
+        hits = self.plain.caster.trace(np.broadcast_to(origin, directions.shape), directions)
+        hit = np.flatnonzero(hits.face >= 0)
         colors = np.zeros((len(rays), 4), np.float32)
         if hit.size:
-            footprint = depth[hit] / np.float32(camera.K[0, 0] * n)
+            seen = hits.taken(hit)
+            footprint = seen.distance / np.float32(camera.K[0, 0] * n)
+            points = origin + directions[hit] * seen.distance[:, None]
             colors[hit, :3] = self._shade(
-                face[hit], barycentric[hit], origin + directions[hit] * depth[hit, None], directions[hit], footprint,
+                seen.face, seen.barycentric, points, directions[hit], footprint,
                 _unit(light.to_sun_cam @ R), light, R,
             )  # fmt: skip
             colors[hit, 3] = 1.0
@@ -98,7 +101,7 @@ class SunlitRenderer:
     ) -> Float32:
         """Radiance (N, 3) at hits, everything in the target frame."""
         to_eye = -directions / np.linalg.norm(directions, axis=1, keepdims=True)
-        geometric = self.plain.face_normals[face].astype(np.float32)
+        geometric = self._target.face_normals[face].astype(np.float32)
         geometric *= np.where(np.einsum("nk,nk->n", geometric, to_eye) < 0, np.float32(-1), np.float32(1))[:, None]
         normal = np.einsum("nk,nkc->nc", barycentric, self._normals[face])
         normal *= np.where(np.einsum("nk,nk->n", normal, geometric) < 0, np.float32(-1), np.float32(1))[:, None]
@@ -183,12 +186,10 @@ class _MipSampler:
                 level = cv2.resize(level, (level.shape[1] // 2, level.shape[0] // 2), interpolation=cv2.INTER_AREA)
                 levels.append(level)
             self._levels.append(levels)
-        corners = target.vertices_m[target.faces]
-        area_m2 = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         a, b = (self._surface.corner_uv[:, i] - self._surface.corner_uv[:, 0] for i in (1, 2))
         texels = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
         sizes = np.array([texture.shape[0] * texture.shape[1] for texture in target.surface.textures] + [0])
-        self._texels_per_m = np.sqrt(texels * sizes[self._surface.texture_id] / area_m2).astype(np.float32)
+        self._texels_per_m = np.sqrt(texels * sizes[self._surface.texture_id] / target.face_areas_m2).astype(np.float32)
 
     def sample(self, face: Int32, barycentric: Float32, footprint_m: Float32) -> Float32:
         """(N,), (N, 3), (N,) -> (N, 3) linear albedo."""

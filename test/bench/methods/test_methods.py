@@ -12,7 +12,7 @@ from hat_ros.config import config_from_dict
 from hat_ros.errors import UsageError
 from hat_ros.geometry import lie
 from hat_ros.stages import BACKENDS, OFFLINE_MOTIONS
-from hat_ros.target.rendering import create_renderer
+from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.tracker import HatTracker, unwrapped
 from hat_ros.types import Camera, Frame, TrackState
 
@@ -37,7 +37,7 @@ def target():
 
 @pytest.fixture(scope="module")
 def frames(target):
-    renderer = create_renderer("embree", target)
+    renderer = RayRenderer(target)
     out = []
     for i in range(N):
         seen = renderer.render(true_pose(i), CAMERA)

@@ -7,7 +7,7 @@ from hat_ros.bench.methods import srt3d
 from hat_ros.bench.methods.srt3d import ColorHistograms, RegionTracker
 from hat_ros.bench.synth.models import build_target
 from hat_ros.geometry import lie
-from hat_ros.target.rendering import create_renderer
+from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.types import Camera, Frame
 
 CAMERA = Camera(np.array([[400.0, 0, 119.5], [0, 400.0, 89.5], [0, 0, 1]]), 240, 180)
@@ -20,7 +20,7 @@ def target():
 
 @pytest.fixture(scope="module")
 def renderer(target):
-    return create_renderer("embree", target)
+    return RayRenderer(target)
 
 
 def pose(i, target, distance=2.6):

@@ -17,7 +17,7 @@ from hat_ros.errors import UsageError
 from hat_ros.geometry import lie
 from hat_ros.io.bag_reader import BagReader
 from hat_ros.target.model import load_target
-from hat_ros.target.rendering import create_renderer
+from hat_ros.target.ray_renderer import RayRenderer
 
 SMALL = ClipSpec(frames=3, width=96, height=72, focal_px=150.0, range_m=(8.0, 6.0))
 
@@ -35,7 +35,7 @@ def test_models_are_metric_coloured_and_survive_a_file(tmp_path, name):
 
 def half_turn_overlap(asymmetry):
     """Silhouette overlap of the observer with its half-turned self, mean over views."""
-    renderer = create_renderer("embree", build_target("observer", asymmetry))
+    renderer = RayRenderer(build_target("observer", asymmetry))
     camera = replace(SMALL, focal_px=200.0).camera
     out = []
     for rotvec in ([1.2, 0.3, 0.1], [1.6, -0.4, 0.8], [0.3, 1.3, 0.2]):
@@ -85,7 +85,7 @@ def test_clip_has_exact_truth_and_the_same_bytes_every_time(tmp_path):
     files = sorted(p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*") if p.is_file())
     assert all((tmp_path / "a" / f).read_bytes() == (tmp_path / "b" / f).read_bytes() for f in files)
     recording = load_sequence(tmp_path / "a")
-    renderer = create_renderer("embree", load_target(recording.target_path))
+    renderer = RayRenderer(load_target(recording.target_path))
     for frame in recording.frames():
         mask = renderer.render(recording.truth()[frame.stamp_ns], recording.camera).mask
         np.testing.assert_array_equal(mask, frame.given_mask > 0)
@@ -199,7 +199,7 @@ def test_missing_parts_are_the_small_ones():
     assert len(fewer.faces) < len(target.faces) and fewer.faces.max() == len(fewer.vertices_m) - 1
     np.testing.assert_allclose(fewer.center_m[:2], target.center_m[:2], atol=0.4)
     camera = SMALL.camera
-    assert create_renderer("embree", fewer).render(lie.transform(np.eye(3), [0, 0, 6.0]), camera).mask.any()
+    assert RayRenderer(fewer).render(lie.transform(np.eye(3), [0, 0, 6.0]), camera).mask.any()
 
 
 @pytest.mark.parametrize("change", [{"recolor": 2.0}, {"missing": 1.0}])
@@ -223,7 +223,7 @@ def test_suite_names_exist_and_rates_are_the_papers():
 def test_named_clips_keep_most_of_the_target_in_view(name):
     clip = get_clip(name).scaled(0.2)
     target = build_target(clip.model, clip.asymmetry)
-    renderer, camera = create_renderer("embree", target), clip.spec.camera
+    renderer, camera = RayRenderer(target), clip.spec.camera
     poses = trajectory(clip.spec, target)
     for T in poses[:: max(1, len(poses) // 6)]:
         u, v = camera.project(T[:3, :3] @ target.center_m + T[:3, 3])
@@ -264,7 +264,7 @@ def test_a_mismatched_clip_ships_the_nominal_model(tmp_path):
     target = load_target(recording.target_path)
     assert target.diameter_m == pytest.approx(build_target("observer").diameter_m, rel=1e-5)
     frame = next(iter(recording.frames()))
-    nominal = create_renderer("embree", target).render(recording.truth()[frame.stamp_ns], recording.camera).mask
+    nominal = RayRenderer(target).render(recording.truth()[frame.stamp_ns], recording.camera).mask
     assert (nominal != (frame.given_mask > 0)).sum() > 20
     with pytest.raises(UsageError, match="exists already"):
         synthesize(clip, tmp_path / "clip")

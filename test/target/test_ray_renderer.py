@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from hat_ros.bench.synth.models import build_target
 from hat_ros.errors import ConfigError, MissingDependencyError
 from hat_ros.geometry import lie
-from hat_ros.target.embree import pixel_rays
 from hat_ros.target.model import target_from_scene
+from hat_ros.target.ray_renderer import RayRenderer
+from hat_ros.target.rays import pixel_rays
 from hat_ros.target.rendering import create_renderer
 from hat_ros.types import Camera
 
@@ -27,7 +28,7 @@ def at(t, rotvec=(0, 0, 0)):
 
 
 def test_depth_of_a_box_face_is_exact():
-    view = create_renderer("embree", scene_target(trimesh.creation.box((1, 1, 1)))).render(at([0, 0, 4]), CAMERA)
+    view = RayRenderer(scene_target(trimesh.creation.box((1, 1, 1)))).render(at([0, 0, 4]), CAMERA)
     assert view.depth_m.dtype == np.float32 and view.face_id.dtype == np.int32 and view.rgb.dtype == np.uint8
     assert view.mask.any()
     np.testing.assert_allclose(view.depth_m[view.mask], 3.5, rtol=1e-6)
@@ -37,7 +38,7 @@ def test_depth_of_a_box_face_is_exact():
 
 def test_depth_of_a_sphere_matches_the_analytic_one():
     sphere = trimesh.creation.icosphere(subdivisions=5, radius=1.0)
-    view = create_renderer("embree", scene_target(sphere)).render(at([0.2, -0.1, 5.0]), CAMERA)
+    view = RayRenderer(scene_target(sphere)).render(at([0.2, -0.1, 5.0]), CAMERA)
     rays = pixel_rays(CAMERA, np.arange(128), np.arange(96))
     center = np.array([0.2, -0.1, 5.0])
     a, b = (rays * rays).sum(-1), rays @ center
@@ -58,7 +59,7 @@ def test_pixel_centres_lie_at_integer_coordinates():
     u_edge, v_edge, z = 60.5, 40.5, 2.0
     x = (u_edge - CAMERA.K[0, 2]) / CAMERA.K[0, 0] * z + 0.5
     y = (v_edge - CAMERA.K[1, 2]) / CAMERA.K[1, 1] * z + 0.5
-    mask = create_renderer("embree", scene_target(plate)).render(at([x, y, z]), CAMERA).mask
+    mask = RayRenderer(scene_target(plate)).render(at([x, y, z]), CAMERA).mask
     rows, cols = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     assert cols[0] == 61 and rows[0] == 41
     np.testing.assert_allclose(CAMERA.project(np.array([x - 0.5, y - 0.5, z])), [u_edge, v_edge], atol=1e-9)
@@ -70,7 +71,7 @@ def test_the_silhouette_is_that_of_the_projected_triangles(seed):
     rng = np.random.default_rng(seed)
     target = build_target("probe")
     T = lie.transform(lie.so3_exp(rng.normal(size=3)), [*rng.uniform(-0.3, 0.3, 2), 8.0])
-    mask = create_renderer("embree", target).render(T, CAMERA, color=False).mask
+    mask = RayRenderer(target).render(T, CAMERA, color=False).mask
     corners = CAMERA.project(target.vertices_m @ T[:3, :3].T + T[:3, 3])[target.faces]  # (F, 3, 2)
     v, u = np.nonzero(cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))))
     to_pixel = np.stack([u, v], axis=-1)[:, None, None] - corners  # (N, F, 3, 2)
@@ -85,7 +86,7 @@ def test_the_silhouette_is_that_of_the_projected_triangles(seed):
 
 def test_a_crop_renders_the_same_pixels():
     target, T = build_target("observer"), at([0.1, 0.2, 6.0], (0.4, 0.3, 0.1))
-    renderer = create_renderer("embree", target)
+    renderer = RayRenderer(target)
     full, part = renderer.render(T, CAMERA), renderer.render(T, CAMERA.crop(40, 20, 50, 60))
     np.testing.assert_array_equal(part.face_id, full.face_id[20:80, 40:90])
     np.testing.assert_array_equal(part.rgb, full.rgb[20:80, 40:90])
@@ -93,14 +94,14 @@ def test_a_crop_renders_the_same_pixels():
 
 def test_two_renderings_have_the_same_bytes():
     target, T = build_target("freighter"), at([0, 0, 9.0], (0.4, 1.3, 0.1))
-    a, b = (create_renderer("embree", target).render(T, CAMERA) for _ in range(2))
+    a, b = (RayRenderer(target).render(T, CAMERA) for _ in range(2))
     for name in ("depth_m", "normal_cam", "face_id", "rgb"):
         assert getattr(a, name).tobytes() == getattr(b, name).tobytes()
 
 
 def test_normals_face_the_camera_and_fit_the_faces():
     target, T = build_target("observer"), at([0, 0, 6.0], (1.0, 0.3, 0.1))
-    view = create_renderer("embree", target).render(T, CAMERA)
+    view = RayRenderer(target).render(T, CAMERA)
     rays = pixel_rays(CAMERA, np.arange(128), np.arange(96))[view.mask]
     normals = view.normal_cam[view.mask]
     assert np.einsum("nk,nk->n", rays, normals).max() < 1e-3
@@ -111,7 +112,7 @@ def test_normals_face_the_camera_and_fit_the_faces():
 
 def test_colour_can_be_left_out():
     target, T = build_target("cubesat"), at([0, 0, 1.5])
-    renderer = create_renderer("embree", target)
+    renderer = RayRenderer(target)
     with_color, without = renderer.render(T, CAMERA), renderer.render(T, CAMERA, color=False)
     assert with_color.rgb[with_color.mask].any() and not without.rgb.any()
     np.testing.assert_array_equal(with_color.face_id, without.face_id)
@@ -119,23 +120,23 @@ def test_colour_can_be_left_out():
 
 @pytest.mark.parametrize("t", [[0, 0, -5], [100, 0, 5], [0, -100, 5]])
 def test_a_target_out_of_view_gives_an_empty_picture(t):
-    view = create_renderer("embree", build_target("cubesat")).render(at(t), CAMERA)
+    view = RayRenderer(build_target("cubesat")).render(at(t), CAMERA)
     assert not view.mask.any() and not view.depth_m.any() and not view.rgb.any()
 
 
 @pytest.mark.parametrize("t", [[0, 0, 5.0], [1.5, -0.5, 4.0], [0, 0, -5]])
 def test_the_silhouette_alone_is_that_of_the_picture(t):
-    renderer = create_renderer("embree", build_target("cubesat"))
+    renderer = RayRenderer(build_target("cubesat"))
     np.testing.assert_array_equal(renderer.silhouette(at(t), CAMERA), renderer.render(at(t), CAMERA).mask)
 
 
 def test_a_camera_inside_the_model_sees_its_inner_walls():
-    view = create_renderer("embree", scene_target(trimesh.creation.box((2, 2, 2)))).render(at([0, 0, 0]), CAMERA)
+    view = RayRenderer(scene_target(trimesh.creation.box((2, 2, 2)))).render(at([0, 0, 0]), CAMERA)
     assert view.mask.all() and view.depth_m.min() > 0.9
 
 
 def test_unknown_renderer():
-    with pytest.raises(ConfigError, match="embree"):
+    with pytest.raises(ConfigError, match="rays"):
         create_renderer("vulkan", build_target("cubesat"))
 
 
@@ -145,9 +146,9 @@ def test_pyrender_agrees_or_says_what_is_missing():
         renderer = create_renderer("pyrender", target)
         view = renderer.render(T, CAMERA)
     except MissingDependencyError as error:
-        assert "embree" in str(error)
+        assert "rays" in str(error)
         return
-    traced = create_renderer("embree", target).render(T, CAMERA)
+    traced = RayRenderer(target).render(T, CAMERA)
     both = view.mask & traced.mask
     assert both.sum() > 0.95 * traced.mask.sum()
     assert np.median(np.abs(view.depth_m - traced.depth_m)[both]) < 0.01
@@ -163,7 +164,7 @@ def test_an_outlined_silhouette_is_the_silhouette_but_for_specks(t):
             trimesh.creation.box((0.6, 0.05, 0.4), lie.transform(np.eye(3), [0.8, 0, 0])),
         ]
     )
-    renderer = create_renderer("embree", scene_target(body))
+    renderer = RayRenderer(scene_target(body))
     for rotvec in ((0, 0, 0), (0.4, -0.8, 0.3), (1.5, 0.2, 2.0)):
         whole, outlined = (cast(at(t, rotvec), CAMERA) for cast in (renderer.silhouette, renderer.outlined))
         assert outlined.shape == whole.shape and outlined.dtype == np.bool_
@@ -172,4 +173,4 @@ def test_an_outlined_silhouette_is_the_silhouette_but_for_specks(t):
 
 
 def test_nothing_is_outlined_behind_the_camera():
-    assert not create_renderer("embree", scene_target(trimesh.creation.box())).outlined(at((0, 0, -4)), CAMERA).any()
+    assert not RayRenderer(scene_target(trimesh.creation.box())).outlined(at((0, 0, -4)), CAMERA).any()
