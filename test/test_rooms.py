@@ -31,6 +31,17 @@ FLOORS = (
 )
 FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
 
+# The same within the laboratory.
+BENCH_FLOORS = (
+    ("datasets",),
+    ("synth", "source", "observations"),
+    ("evaluation",),
+    ("methods",),
+    ("runs",),
+    ("experiments",),
+)
+BENCH_FLOOR = {room: number for number, rooms in enumerate(BENCH_FLOORS) for room in rooms}
+
 
 def room_of(path: Path) -> str:
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
@@ -58,6 +69,20 @@ def test_imports_go_one_way(path):
         other = module.split(".")[1]
         below = other == room or FLOOR[other] < FLOOR[room]
         assert below, f"{path.relative_to(PACKAGE)} imports {module}, which stands above or beside it"
+
+
+BENCH_SOURCES = [path for path in SOURCES if room_of(path) == "bench" and path.parent.parent != PACKAGE]
+BENCH_SOURCES += [path for path in (PACKAGE / "bench").glob("*.py") if path.name != "__init__.py"]
+
+
+@pytest.mark.parametrize("path", BENCH_SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_go_one_way_within_the_laboratory(path):
+    room = path.relative_to(PACKAGE).parts[1].removesuffix(".py")
+    for module in imports(path):
+        if module.startswith("hat_ros.bench."):
+            other = module.split(".")[2]
+            below = other == room or BENCH_FLOOR[other] < BENCH_FLOOR[room]
+            assert below, f"{path.relative_to(PACKAGE)} imports {module}, which stands above or beside it"
 
 
 def test_what_is_flown_loads_no_laboratory():

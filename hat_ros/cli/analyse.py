@@ -30,7 +30,7 @@ def _add_evaluate(commands: Commands) -> None:
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
-    from hat_ros.bench.evaluation.folder import evaluate_folder
+    from hat_ros.bench.evaluation.result_folder import evaluate_folder
     from hat_ros.cli.console import print_figures
 
     evaluate_folder(arguments.folder, arguments.truth)
@@ -51,7 +51,7 @@ def _add_plot(commands: Commands) -> None:
 
 
 def _plot(arguments: argparse.Namespace) -> int:
-    from hat_ros.bench.evaluation.folder import plot_folder
+    from hat_ros.bench.evaluation.result_folder import plot_folder
 
     for path in plot_folder(arguments.folder, arguments.out or arguments.folder / "plots", arguments.format):
         print(path)
@@ -82,7 +82,7 @@ def _add_score(commands: Commands) -> None:
 
 
 def _score(arguments: argparse.Namespace) -> int:
-    from hat_ros.bench.external_poses import ScoreOptions, score_poses
+    from hat_ros.bench.runs.external import ScoreOptions, score_poses
     from hat_ros.cli.console import print_figures
 
     options = ScoreOptions(

@@ -68,7 +68,7 @@ def _add_credits(parser: argparse.ArgumentParser, default: str) -> None:
 
 
 def _replay(arguments: argparse.Namespace) -> int:
-    from hat_ros.bench.runs import ReplayOptions, replay_bag
+    from hat_ros.bench.runs.replay import ReplayOptions, replay_bag
     from hat_ros.cli.console import print_figures, state_progress
 
     options = ReplayOptions(
@@ -119,7 +119,7 @@ def _add_track(commands: Commands) -> None:
 
 def _track(arguments: argparse.Namespace) -> int:
     limit_threads(arguments.threads)
-    from hat_ros.bench.runs import TrackOptions, track
+    from hat_ros.bench.runs.track import TrackOptions, track
     from hat_ros.cli.console import print_figures, state_progress
 
     spec = spec_of(arguments)
@@ -155,7 +155,8 @@ def _add_temporal(commands: Commands) -> None:
 
 
 def _temporal(arguments: argparse.Namespace) -> int:
-    from hat_ros.bench.temporal import load_observations, run_offline, run_temporal, save_result
+    from hat_ros.bench.methods.temporal import run_offline, run_temporal, save_result
+    from hat_ros.bench.observations import load_observations
 
     run = run_offline if arguments.offline else run_temporal
     config = config_of(arguments)

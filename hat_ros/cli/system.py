@@ -119,7 +119,7 @@ def _add_profile(commands: Commands) -> None:
 
 def _profile(arguments: argparse.Namespace) -> int:
     limit_threads(arguments.threads)
-    from hat_ros.bench.profiler import profile
+    from hat_ros.bench.experiments.profile import profile
     from hat_ros.cli.console import state_progress
     from hat_ros.io.results import write_json
 

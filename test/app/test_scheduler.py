@@ -10,7 +10,7 @@ from scripted import ScriptedMethod, frame, stamp
 
 from hat_ros.app.pipeline import Pipeline
 from hat_ros.app.scheduler import Closed, StageScheduler
-from hat_ros.bench.methods import create_method
+from hat_ros.bench.methods.modes import create_method
 from hat_ros.bench.synth.clips import ClipSpec, render_clip
 from hat_ros.bench.synth.models import build_target
 from hat_ros.config import load_config

@@ -34,9 +34,7 @@ def bag(tmp_path):
 @pytest.fixture
 def scripted(monkeypatch):
     """`hat track` with a method that needs no backend."""
-    import hat_ros.bench.runs
-
-    monkeypatch.setattr(hat_ros.bench.runs, "create_method", lambda *_: ScriptedMethod())
+    monkeypatch.setattr("hat_ros.bench.runs.track.create_method", lambda *_: ScriptedMethod())
 
 
 @pytest.fixture
@@ -68,7 +66,7 @@ def test_commands_are_all_listed():
 
 
 def test_choices_repeated_for_a_light_start_are_the_real_ones():
-    from hat_ros.bench.methods import MODES
+    from hat_ros.bench.methods.modes import MODES
 
     assert run.MODES == MODES
     assert tuple(FORMATS) == data.FORMATS
@@ -127,12 +125,10 @@ def test_wrong_usage_is_exit_code_2(text, capsys):
 
 
 def test_failed_run_is_exit_code_1(monkeypatch, capsys, bag, settings, tmp_path):
-    import hat_ros.bench.runs
-
     def fail(*_, **__):
         raise RunError("the disk is\nfull")
 
-    monkeypatch.setattr(hat_ros.bench.runs, "track", fail)
+    monkeypatch.setattr("hat_ros.bench.runs.track.track", fail)
     assert main(["track", str(bag), "--out", str(tmp_path / "out"), "--config", settings]) == 1
     assert capsys.readouterr().err.strip().splitlines()[-1] == "hat: the disk is full"
 
@@ -155,8 +151,6 @@ def test_track_writes_the_promised_folder(scripted, bag, settings, tmp_path, cap
 def test_recorded_masks_reach_the_method_only_when_given_and_judge_its_own_either_way(
     monkeypatch, bag, settings, tmp_path, backend, given
 ):
-    import hat_ros.bench.runs
-
     seen = []
 
     class Sees(ScriptedMethod):
@@ -164,7 +158,7 @@ def test_recorded_masks_reach_the_method_only_when_given_and_judge_its_own_eithe
             seen.append(frame.given_mask is not None)
             return super().step(frame)
 
-    monkeypatch.setattr(hat_ros.bench.runs, "create_method", lambda *_: Sees())
+    monkeypatch.setattr("hat_ros.bench.runs.track.create_method", lambda *_: Sees())
     command = ["track", str(bag), "--out", str(tmp_path / "out"), "--config", settings, "--quiet", "--no-video"]
     assert main([*command, "--no-report", "--set", f"segmentation.backend={backend}"]) == 0
     assert seen == [given] * 10
@@ -206,15 +200,13 @@ def test_track_the_same_twice_gives_the_same_bytes(scripted, bag, settings, tmp_
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])
 def test_stopped_run_leaves_readable_results(monkeypatch, bag, settings, tmp_path, capsys, error):
-    import hat_ros.bench.runs
-
     class Stops(ScriptedMethod):
         def step(self, seen):
             if seen.stamp_ns == stamp(6):
                 raise error
             return super().step(seen)
 
-    monkeypatch.setattr(hat_ros.bench.runs, "create_method", lambda *_: Stops())
+    monkeypatch.setattr("hat_ros.bench.runs.track.create_method", lambda *_: Stops())
     code = main(["track", str(bag), "--out", str(tmp_path / "out"), "--config", settings, "--quiet"])
     assert code == (130 if isinstance(error, KeyboardInterrupt) else 1)
     said = capsys.readouterr().err

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from temporal_scene import make_scene, preset, rotation_error_deg
 
-from hat_ros.bench.temporal import run_temporal
+from hat_ros.bench.methods.temporal import run_temporal
 from hat_ros.core.inertia import InertialPrior
 from hat_ros.geometry import lie
 

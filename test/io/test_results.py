@@ -7,7 +7,7 @@ import pytest
 import yaml
 from scripted import CAMERA, stamp, steps, true_row, truth
 
-from hat_ros.bench.evaluation.pose_tables import write_tables
+from hat_ros.bench.evaluation.result_folder import write_tables
 from hat_ros.config import HatConfig, config_from_dict
 from hat_ros.errors import BagError, UsageError
 from hat_ros.io.result_bag import ResultBagWriter, read_result_bag

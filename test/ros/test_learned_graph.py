@@ -15,7 +15,7 @@ import pytest
 from graph_clip import said, status_column
 from rosbags.rosbag2 import Reader
 
-from hat_ros.bench.runs import ReplayOptions, replay_bag
+from hat_ros.bench.runs.replay import ReplayOptions, replay_bag
 from hat_ros.config import load_config
 from hat_ros.io import topics
 from hat_ros.io.result_bag import read_result_bag

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hat_ros.bench.temporal import Observations
+from hat_ros.bench.observations import Observations
 from hat_ros.config import load_config
 from hat_ros.geometry import lie
 

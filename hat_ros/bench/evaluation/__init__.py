@@ -1,1 +1,1 @@
-"""What a run is worth: metrics, reports, benchmarks, ablations."""
+"""What a run is worth: metrics, tables, figures, reports."""

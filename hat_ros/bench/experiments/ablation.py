@@ -19,8 +19,8 @@ from hat_ros.bench.evaluation import metrics
 from hat_ros.bench.evaluation.tables import Column, Table
 from hat_ros.bench.experiments.ablation_rows import Row, table_rows
 from hat_ros.bench.experiments.run_matrix import Job, Outcome
+from hat_ros.bench.methods.temporal import replay_temporal
 from hat_ros.bench.source import SourceSpec
-from hat_ros.bench.temporal_replay import replay_temporal
 from hat_ros.config import HatConfig, load_config
 from hat_ros.errors import RunError, UsageError
 from hat_ros.geometry import lie

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from hat_ros.bench.experiments.filters import FilterNoise, ParticleSelector, UkfSelector
-from hat_ros.bench.temporal_replay import replay_offline, replay_temporal
+from hat_ros.bench.methods.filters import FilterNoise, ParticleSelector, UkfSelector
+from hat_ros.bench.methods.temporal import replay_offline, replay_temporal
 from hat_ros.config import HatConfig, flat_options
 from hat_ros.io.run_log import RunLog
 

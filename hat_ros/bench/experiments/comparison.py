@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from glob import glob
@@ -13,9 +12,10 @@ import numpy as np
 
 from hat_ros.bench.datasets.importer import detections_by_sequence, open_dataset
 from hat_ros.bench.evaluation import metrics
+from hat_ros.bench.evaluation.result_folder import read_errors
 from hat_ros.bench.evaluation.tables import Column, Table
 from hat_ros.bench.experiments.run_matrix import GRAPH, Job, Outcome
-from hat_ros.bench.methods import MODES
+from hat_ros.bench.methods.modes import MODES
 from hat_ros.bench.source import SourceSpec
 from hat_ros.bench.synth.suite import SUITE, SUITE_SETTINGS
 from hat_ros.errors import UsageError
@@ -250,7 +250,7 @@ _POOLED = {
 
 
 def _pooled(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    errors = np.vstack([_frame_errors(outcome.folder) for outcome in outcomes])
+    errors = np.vstack([read_errors(outcome.folder) for outcome in outcomes])
     targets = sum(outcome.figures["targets"] for outcome in outcomes)
     seconds = [outcome.figures["frames"] / fps for outcome in outcomes if (fps := outcome.figures.get("fps"))]
     frames = sum(outcome.figures["frames"] for outcome in outcomes if outcome.figures.get("fps"))
@@ -261,13 +261,6 @@ def _pooled(outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "coverage": sum(outcome.figures["valid"] for outcome in outcomes) / targets if targets else None,
         "fps": frames / sum(seconds) if seconds else None,
     }
-
-
-def _frame_errors(folder: Path) -> np.ndarray:
-    """(N, 3) E_t in metres, E_q in degrees, E_p of every frame of a run; NaN where there is none."""
-    with (folder / "poses.csv").open(newline="", encoding="utf-8") as file:
-        rows = [[row["E_t_m"], row["E_q_deg"], row["E_p"]] for row in csv.DictReader(file)]
-    return np.array([[float(cell) if cell else np.nan for cell in row] for row in rows]).reshape(-1, 3)
 
 
 def failures(outcomes: Sequence[Outcome]) -> list[str]:

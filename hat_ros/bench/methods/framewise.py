@@ -1,4 +1,4 @@
-"""The methods that answer frame by frame; see :mod:`hat_ros.bench.methods`."""
+"""The methods that answer frame by frame; see :mod:`hat_ros.bench.methods.modes`."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from hat_ros.array_types import Bool, Float
 from hat_ros.bench.methods.framewise import Hat
-from hat_ros.bench.methods.smoothing import smooth_measured, solve_offline
+from hat_ros.bench.methods.smoothing import smooth_anchors, smooth_measured
 from hat_ros.config import HatConfig
 from hat_ros.geometry import lie
 from hat_ros.motion.stage import suppress_background
@@ -61,7 +61,7 @@ class Offline:
         if not steps:
             return []
         motions = self._motions()
-        result = solve_offline([step.candidates for step in steps], motions, self._config)
+        result = smooth_anchors([step.candidates for step in steps], motions, self._config)
         T_final, covariances = result.T_cam_target, [_NO_COVARIANCE] * len(steps)
         if self._refiner is not None:
             T_final = self._best_known(T_final, result.tied)

@@ -34,7 +34,7 @@ _MAD_TO_SIGMA = 1.4826
 
 
 @dataclass(frozen=True)
-class OfflineResult:
+class Smoothed:
     """Hindsight for N frames.
 
     Attributes:
@@ -50,7 +50,7 @@ class OfflineResult:
     tied: Bool
 
 
-def solve_offline(candidates: Sequence[Candidates], motions: Sequence[Motion], config: HatConfig) -> OfflineResult:
+def smooth_anchors(candidates: Sequence[Candidates], motions: Sequence[Motion], config: HatConfig) -> Smoothed:
     """Decode, gate, align and optimise a whole sequence.
 
     Args:
@@ -76,7 +76,7 @@ def solve_offline(candidates: Sequence[Candidates], motions: Sequence[Motion], c
         if gate_weight[frame]:
             graph.add_pose(frame, anchor)
             graph.add_anchor(frame, anchor, weight)
-    return OfflineResult(_hold(graph.solve()), chosen, gate_weight, tied)
+    return Smoothed(_hold(graph.solve()), chosen, gate_weight, tied)
 
 
 def smooth_measured(T_measured: Float, motions: Sequence[Motion], config: HatConfig) -> Float:

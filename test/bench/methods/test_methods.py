@@ -6,7 +6,7 @@ import scripted_backends
 from scripted import stamp
 from scripted_backends import index_of, true_pose
 
-from hat_ros.bench.methods import MODES, create_method
+from hat_ros.bench.methods.modes import MODES, create_method
 from hat_ros.bench.synth.models import build_target
 from hat_ros.config import config_from_dict
 from hat_ros.errors import UsageError

@@ -9,8 +9,8 @@ import scipy.optimize
 from temporal_scene import HALF_TURN, make_scene, preset, rotation_error_deg
 
 from hat_ros.bench.methods.pose_graph import PoseGraph
-from hat_ros.bench.methods.smoothing import backtrace, consistent, smooth_measured, solve_offline
-from hat_ros.bench.temporal import run_temporal
+from hat_ros.bench.methods.smoothing import backtrace, consistent, smooth_anchors, smooth_measured
+from hat_ros.bench.methods.temporal import run_temporal
 from hat_ros.config import FusionConfig, load_config
 from hat_ros.core.selector import motion_penalty, scaled_score
 from hat_ros.geometry import lie
@@ -69,7 +69,7 @@ def test_hindsight_is_no_worse_than_causal(name):
     for seed in range(3):
         scene = make_scene(160, seed=seed, noise_deg=4)
         result = run_temporal(scene.observations, config)
-        offline = solve_offline(*_recorded(scene, config.hypotheses.guard), config)
+        offline = smooth_anchors(*_recorded(scene, config.hypotheses.guard), config)
         causal_deg.append(rotation_error_deg(result.T_cam_target, scene.T_cam_target).mean())
         offline_deg.append(rotation_error_deg(offline.T_cam_target, scene.T_cam_target).mean())
         assert lie.is_rigid(offline.T_cam_target, 1e-9).all()
@@ -81,12 +81,12 @@ def test_frames_without_slam_or_anchor_hold_their_neighbour():
     candidates, motions = _recorded(scene)
     for i in (1, 2, 3, 30, 31):
         motions[i] = Motion.none()
-    T = solve_offline(candidates, motions, preset()).T_cam_target
+    T = smooth_anchors(candidates, motions, preset()).T_cam_target
     np.testing.assert_array_equal(T[1:4], T[[0, 0, 0]])
     np.testing.assert_array_equal(T[30:32], T[[29, 29]])
-    tied = solve_offline(candidates, motions, preset()).tied
+    tied = smooth_anchors(candidates, motions, preset()).tied
     assert np.flatnonzero(~tied).tolist() == [1, 2, 3, 30, 31], "held, or an anchor that nothing can be compared with"
-    empty = solve_offline([Candidates.none()] * 3, motions[:3], preset())
+    empty = smooth_anchors([Candidates.none()] * 3, motions[:3], preset())
     assert np.isnan(empty.T_cam_target).all()
 
 
@@ -107,7 +107,7 @@ def test_poses_do_not_bow_between_anchors_when_the_scale_drifts(weight):
     scene = make_scene(120, gap=6, noise_deg=0, noise_m=0, rate_deg=4, gauge=np.eye(4))
     candidates, _ = _recorded(scene)
     config = preset("pico_hat", fusion={"relative_weight": weight}, selector={"running_gate": False})
-    result = solve_offline(candidates, _tumbling_motion(scene, scale_drift=0.001), config)
+    result = smooth_anchors(candidates, _tumbling_motion(scene, scale_drift=0.001), config)
     keys = np.flatnonzero(scene.observations.key)
     between = slice(keys[0], keys[-1])
     shift_m = np.linalg.norm(result.T_cam_target[:, :3, 3] - scene.T_cam_target[:, :3, 3], axis=1)
@@ -154,7 +154,7 @@ class TestConsistent:
         T = candidates[20].T_cam_target[0]
         flipped = lie.transform(scene.T_cam_target[20, :3, :3] @ HALF_TURN, T[:3, 3])
         candidates[20] = Candidates.from_matrices(flipped[None], np.ones(1))
-        result = solve_offline(candidates, motions, preset(selector={"motion_weight_per_deg": 0.0}))
+        result = smooth_anchors(candidates, motions, preset(selector={"motion_weight_per_deg": 0.0}))
         assert np.flatnonzero(result.gate_weight == 0.0).tolist() == [20]
         assert np.isnan(result.gate_weight[1])
         assert rotation_error_deg(result.T_cam_target[20], scene.T_cam_target[20]) < 5

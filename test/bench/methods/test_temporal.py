@@ -1,14 +1,16 @@
 """Stages 3 and 4 over recorded observations: the published schedule, invariances, causality, bad files."""
 
-import zipfile
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from observed_log import CONFIG, observations
 from temporal_scene import HALF_TURN, make_scene, preset, rotation_error_deg
 
-from hat_ros.bench.temporal import Observations, load_observations, run_offline, run_temporal, save_result
-from hat_ros.errors import CandidateError, InputError
+from hat_ros.bench.evaluation.metrics import pose_errors
+from hat_ros.bench.methods.temporal import keyframes_of, replay_offline, replay_temporal, run_offline, run_temporal
+from hat_ros.bench.observations import Observations, observations_of
+from hat_ros.errors import CandidateError
 from hat_ros.geometry import lie
 
 PRESETS = ("mega_hat", "pico_hat", "mega_hat_spark")
@@ -265,116 +267,33 @@ def test_opposite_ends_of_the_half_turn_are_no_trouble():
     np.testing.assert_allclose(result.T_cam_target[12:], scene.T_cam_target[12:], atol=1e-9)
 
 
-class TestFiles:
-    @staticmethod
-    def _arrays(n=6, k=2):
-        o = make_scene(n, k).observations
-        return {"slam": o.slam, "key": o.key, "poses": o.poses, "scores": o.scores, "box_area_px": o.box_area_px}
+def test_keyframes_follow_gap_and_k():
+    log = observations()
+    groups = keyframes_of(log, replace(CONFIG, hypotheses=replace(CONFIG.hypotheses, max_candidates=1)))
+    assert [len(group) for group in groups[:9]] == [1, 0, 0, 0, 1, 0, 0, 0, 1]
 
-    def _load(self, tmp_path, arrays):
-        path = tmp_path / "obs.npz"
-        np.savez(path, **arrays)
-        return load_observations(path)
 
-    def test_a_good_file_and_its_result_survive_the_disk(self, tmp_path):
-        observations = self._load(tmp_path, self._arrays())
-        result = run_temporal(observations, preset())
-        save_result(tmp_path / "out.npz", result)
-        with np.load(tmp_path / "out.npz") as data:
-            assert {"T_cam_target", "chosen", "accepted", "resets"} <= set(data)
-            np.testing.assert_array_equal(data["T_cam_target"], result.T_cam_target)
-            assert data["chosen"].shape == data["accepted"].shape == (6,)
-            assert data["resets"].ndim == 1
-        assert [path.name for path in tmp_path.iterdir() if "partial" in path.name] == []
+def test_replay_is_hat_temporal_on_the_same_observations():
+    log = observations(flip_every=3)
+    due = np.array([len(group) > 0 for group in keyframes_of(log, CONFIG)])
+    recorded = replace(observations_of(log), key=due)
+    expected = run_temporal(recorded, CONFIG)
+    replayed = replay_temporal(log, CONFIG)
+    np.testing.assert_allclose(replayed.T_est, expected.T_cam_target, atol=1e-9)
+    np.testing.assert_array_equal(replayed.anchor, expected.chosen)
 
-    def test_single_precision_is_accepted(self, tmp_path):
-        arrays = {name: a if name == "key" else a.astype(np.float32) for name, a in self._arrays().items()}
-        assert self._load(tmp_path, arrays).slam.dtype == np.float64
 
-    def test_the_box_area_is_optional(self, tmp_path):
-        arrays = self._arrays()
-        del arrays["box_area_px"]
-        assert self._load(tmp_path, arrays).box_area_px is None
-
-    @pytest.mark.parametrize("name", ["slam", "key", "poses", "scores"])
-    def test_a_missing_array_is_named(self, name, tmp_path):
-        arrays = self._arrays()
-        del arrays[name]
-        with pytest.raises(InputError, match=f"'{name}' is missing"):
-            self._load(tmp_path, arrays)
-
-    @pytest.mark.parametrize(
-        ("name", "change", "message"),
-        [
-            ("slam", lambda a: a[:-1], r"slam: expected shape \(6, 4, 4\)"),
-            ("slam", lambda a: a[:, :3], r"slam: expected shape"),
-            ("key", lambda a: a.astype(int), "key: expected dtype bool, found int64"),
-            ("key", lambda a: a[:0], "N >= 1"),
-            ("key", lambda a: a[:, None], r"key: expected shape \(N,\)"),
-            ("poses", lambda a: a[:, 0], "poses: expected shape"),
-            ("poses", lambda a: a[:, :, :, :3], "poses: expected shape"),
-            ("scores", lambda a: a[:, :1], r"scores: expected shape \(6, 2\)"),
-            ("scores", lambda a: a.astype(np.complex128), "scores: expected a floating-point dtype"),
-            ("scores", lambda a: np.zeros(a.shape, dtype=np.int64), "scores: expected a floating-point dtype"),
-            ("box_area_px", lambda a: a[:2], "box_area_px: expected shape"),
-            ("box_area_px", lambda a: -a, "box_area_px: must be zero or more"),
-        ],
+def test_every_frame_after_the_first_anchor_has_a_pose():
+    log = observations()
+    sparse = replace(
+        CONFIG, keyframes=replace(CONFIG.keyframes, gap_frames=70), fusion=replace(CONFIG.fusion, coast_limit_frames=1)
     )
-    def test_wrong_shapes_and_types_are_named(self, name, change, message, tmp_path):
-        arrays = self._arrays()
-        arrays[name] = change(arrays[name])
-        with pytest.raises(InputError, match=message):
-            self._load(tmp_path, arrays)
+    assert replay_temporal(log, sparse).has_output.all()
 
-    def test_no_candidates_per_frame_is_an_error(self, tmp_path):
-        arrays = self._arrays()
-        arrays["poses"], arrays["scores"] = np.zeros((6, 0, 4, 4)), np.zeros((6, 0))
-        with pytest.raises(InputError, match="K = 0"):
-            self._load(tmp_path, arrays)
 
-    def test_a_slam_pose_that_is_neither_rigid_nor_nan_is_named(self, tmp_path):
-        for value in (np.nan, 3.0, np.inf):
-            arrays = self._arrays()
-            arrays["slam"] = arrays["slam"].copy()
-            arrays["slam"][4, 0, 0] = value
-            with pytest.raises(InputError, match="slam: frame 4"):
-                self._load(tmp_path, arrays)
-
-    @pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 cut short"])
-    def test_a_file_that_is_no_archive(self, content, tmp_path):
-        path = tmp_path / "obs.npz"
-        path.write_bytes(content)
-        with pytest.raises(InputError, match=r"not a readable \.npz"):
-            load_observations(path)
-
-    def test_a_truncated_archive(self, tmp_path):
-        path = tmp_path / "obs.npz"
-        np.savez(path, **self._arrays())
-        path.write_bytes(path.read_bytes()[:-200])
-        with pytest.raises(InputError):
-            load_observations(path)
-
-    def test_a_missing_file(self, tmp_path):
-        with pytest.raises(InputError, match="no such file"):
-            load_observations(tmp_path / "nowhere.npz")
-
-    def test_pickled_objects_are_refused(self, tmp_path):
-        arrays = self._arrays()
-        arrays["poses"] = np.array([{"a": 1}] * 6, dtype=object)
-        path = tmp_path / "obs.npz"
-        np.savez(path, allow_pickle=True, **arrays)
-        with pytest.raises(InputError):
-            load_observations(path)
-
-    def test_a_compression_bomb_is_refused_before_it_unpacks(self, tmp_path, monkeypatch):
-        monkeypatch.setattr("hat_ros.bench.temporal.MAX_UNPACKED_BYTES", 1000)
-        path = tmp_path / "obs.npz"
-        np.savez_compressed(path, **self._arrays())
-        with pytest.raises(InputError, match="MiB"):
-            load_observations(path)
-        assert zipfile.is_zipfile(path)
-
-    def test_an_unwritable_result_is_an_input_error(self, tmp_path):
-        result = run_temporal(make_scene(5).observations, preset())
-        with pytest.raises(InputError, match="cannot be written"):
-            save_result(tmp_path / "no" / "such" / "folder.npz", result)
+def test_offline_is_no_worse_than_causal_on_the_same_observations():
+    log = observations(flip_every=2, noise_deg=2.0)
+    causal, offline = replay_temporal(log, CONFIG), replay_offline(log, CONFIG)
+    assert offline.has_output.all()
+    errors = [pose_errors(answer.T_est, answer.T_true).pose.mean() for answer in (offline, causal)]
+    assert errors[0] <= errors[1]

@@ -17,7 +17,8 @@ from types import TracebackType
 from typing import Any
 
 from hat_ros.bench.evaluation.tables import Column, Table
-from hat_ros.bench.runs import GIVEN_MASK_BACKENDS, Watcher
+from hat_ros.bench.runs.folder import Watcher
+from hat_ros.bench.runs.track import GIVEN_MASK_BACKENDS
 from hat_ros.bench.source import Source
 from hat_ros.config import HatConfig
 from hat_ros.errors import MissingDependencyError, UsageError

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from hat_ros.bench.profiler import PARTS, Meter, Part, parts_of, profile
+from hat_ros.bench.experiments.profile import PARTS, Meter, Part, parts_of, profile
 from hat_ros.bench.source import open_source
 from hat_ros.bench.synth.clips import ClipSpec
 from hat_ros.bench.synth.suite import Clip, synthesize

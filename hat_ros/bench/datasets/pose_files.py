@@ -1,7 +1,4 @@
-"""Poses of a method that is not part of this package, scored beside those that are.
-
-Trackers under other licences (RGBTrack, FoundationPose, a lab's own) are run by those who have them; what they bring is
-a file of poses, and from then on they are a run like any other: a result folder, a row in the benchmark's table.
+"""Files of poses that another tracker made of a recording.
 
 * TUM: ``stamp x y z qx qy qz qw`` per line, stamp in seconds of the recording's clock (what `poses.tum` holds).
 * BOP: a ``.csv`` with ``scene_id,im_id,obj_id,score,R,t,time``, R 9 and t 3 numbers separated by blanks, t in
@@ -16,32 +13,19 @@ Poses map target (the CAD file's own axes) to camera (OpenCV), as everywhere her
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from hat_ros.array_types import Float
 from hat_ros.bench.datasets.image_files import stamp_of
-from hat_ros.bench.evaluation.folder import complete_folder
-from hat_ros.bench.source import Source, SourceSpec
-from hat_ros.config import HatConfig
-from hat_ros.errors import InputError, UsageError
+from hat_ros.errors import InputError
 from hat_ros.geometry import lie
-from hat_ros.io.bag_reader import BagReader
-from hat_ros.io.provenance import describe_run, input_hash
-from hat_ros.io.result_bag import ResultBagWriter
-from hat_ros.io.results import CONFIG_FILE, RUN_FILE, ResultFolder, write_json
-from hat_ros.tracker import Step
-from hat_ros.types import Candidates, Estimate, Motion, Selection, TrackState
 
-# Stamps that went through another program's floating point.
-_STAMP_TOLERANCE_NS = 1_000_000
 _BOP_COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
-_NO_POSE = np.full(7, np.nan)
-_NO_COVARIANCE = np.full((6, 6), np.nan)
 
 
 @dataclass(frozen=True)
@@ -55,25 +39,6 @@ class ExternalPoses:
 
     rows: dict[int, Float]
     seconds: Float
-
-
-@dataclass(frozen=True)
-class ScoreOptions:
-    """How to score.
-
-    Attributes:
-        method: what the table calls it.
-        fps: frames per second as measured by who ran it; None = from the file, if it says.
-        start, limit, video, report, overwrite: as for a run of our own.
-    """
-
-    method: str
-    fps: float | None = None
-    start: int = 0
-    limit: int | None = None
-    video: bool = True
-    report: bool = True
-    overwrite: bool = False
 
 
 def read_poses(path: Path, scene: tuple[int, int] | None = None) -> ExternalPoses:
@@ -94,85 +59,6 @@ def read_poses(path: Path, scene: tuple[int, int] | None = None) -> ExternalPose
     if not poses.rows:
         raise InputError(f"poses {path}: holds no pose" + (f" of scene, object {scene}" if scene else ""))
     return poses
-
-
-def score_poses(spec: SourceSpec, poses: Path, out: Path, options: ScoreOptions) -> Path:
-    """Write the result folder of an external method's poses on a recording.
-
-    Raises:
-        InputError: the recording or the file of poses is bad, or they share no frame.
-        UsageError: ``out`` exists and must not be replaced.
-    """
-    folder = ResultFolder(out, options.overwrite)
-    source = spec.open()
-    stamps = frame_stamps(source, options.start, options.limit)
-    found = read_poses(poses, getattr(source.recording, "scene", None))
-    rows = match_stamps(stamps, found.rows)
-    if not rows:
-        raise InputError(f"poses {poses}: none lies within 1 ms of a frame of {spec.path}; stamps begin at {stamps[0]}")
-    with folder:
-        (folder.path / CONFIG_FILE).write_text(f"# {options.method}: poses of an external method\n", encoding="utf-8")
-        run = describe_run(
-            spec.path,
-            spec.sha256(),
-            HatConfig(),
-            **spec.describe(),
-            mode=options.method,
-            poses=str(poses.resolve()),
-            poses_sha256=input_hash(poses),
-            poses_unmatched=len(found.rows) - len(rows),
-            start=options.start,
-            limit=options.limit,
-        )
-        write_json(folder.path / RUN_FILE, run | {"config_sha256": None})
-        _write_bag(folder.bag_path, source, stamps, rows)
-        fps = options.fps if options.fps is not None else _rate(found.seconds)
-        measured = {"fps": fps, "latency_ms_p50": float("nan"), "latency_ms_p99": float("nan")}
-        complete_folder(folder.path, source, measured, video=options.video, report=options.report)
-    return folder.final_path
-
-
-def frame_stamps(source: Source, start: int = 0, limit: int | None = None) -> list[int]:
-    """Stamps of the recording's frames in order, without decoding them.
-
-    Raises:
-        UsageError: ``start`` leaves no frame.
-    """
-    recording = source.recording
-    if isinstance(recording, BagReader):
-        every = (packet.stamp_ns for packet in recording.packets())
-    else:
-        every = (item.stamp_ns for item in recording.files)
-    stamps = list(islice(every, start, None if limit is None else start + limit))
-    if not stamps:
-        raise UsageError(f"{source.path} has {source.count()} frames, --start {start} leaves none")
-    return stamps
-
-
-def match_stamps(stamps: list[int], rows: dict[int, Float]) -> dict[int, Float]:
-    """Frame stamp -> pose row of the pose stamped within 1 ms of it; the nearest, where there are several."""
-    given = np.array(sorted(rows), dtype=np.int64)
-    matched = {}
-    for stamp in stamps:
-        after = int(np.searchsorted(given, stamp))
-        near = given[max(after - 1, 0) : after + 1]
-        nearest = int(near[np.argmin(np.abs(near - stamp))]) if len(near) else None
-        if nearest is not None and abs(nearest - stamp) <= _STAMP_TOLERANCE_NS:
-            matched[stamp] = rows[nearest]
-    return matched
-
-
-def _write_bag(path: Path, source: Source, stamps: list[int], rows: dict[int, Float]) -> None:
-    with ResultBagWriter(path, source.frame_id, source.target.name) as bag:
-        for stamp in stamps:
-            state = TrackState.TRACKING if stamp in rows else TrackState.LOST
-            estimate = Estimate(stamp, state, rows.get(stamp, _NO_POSE), _NO_COVARIANCE)
-            bag.write_step(Step(None, Candidates.none(), Motion.none(), Selection.none(), estimate), 0)
-        bag.write_context(source.recording.camera, source.truth_rows())
-
-
-def _rate(seconds: Float) -> float:
-    return float(1.0 / seconds.mean()) if len(seconds) and seconds.mean() > 0 else float("nan")
 
 
 def _read_text(path: Path) -> str:
@@ -245,7 +131,7 @@ def _read_bop(path: Path, text: str, scene: tuple[int, int] | None) -> ExternalP
     return ExternalPoses({stamp_of(image): row for image, (_, row) in best.items()}, np.array(list(seconds.values())))
 
 
-def _numbers(words: list[str | None], where: str, count: int | None = None) -> Float:
+def _numbers(words: Sequence[str | None], where: str, count: int | None = None) -> Float:
     try:
         values = np.array([float(word or "nothing") for word in words])
     except ValueError:

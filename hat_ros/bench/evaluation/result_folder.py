@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -10,19 +12,34 @@ import cv2
 import numpy as np
 
 from hat_ros.app.overlay import OverlayPainter, VideoFile
-from hat_ros.array_types import UInt8
+from hat_ros.array_types import Float, UInt8
 from hat_ros.bench.evaluation.figures import error_figure, image_bytes, range_figure
-from hat_ros.bench.evaluation.pose_tables import write_tables
+from hat_ros.bench.evaluation.metrics import pose_errors
 from hat_ros.bench.evaluation.report import write_report
 from hat_ros.bench.evaluation.score import score_run
+from hat_ros.bench.observations import save_observations
 from hat_ros.bench.source import Source, SourceSpec, open_source
-from hat_ros.bench.temporal_replay import save_observations
 from hat_ros.errors import BagError, HatError, RunError, UsageError
 from hat_ros.io.result_bag import read_result_bag
-from hat_ros.io.results import BAG_FOLDER, CONFIG_FILE, METRICS_FILE, RUN_FILE, write_json
+from hat_ros.io.results import BAG_FOLDER, CONFIG_FILE, METRICS_FILE, RUN_FILE, tum_line, write_json
 from hat_ros.io.run_log import RunLog
 from hat_ros.types import Frame, TrackState
 
+POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+CSV_COLUMNS = (
+    "stamp_ns",
+    "state",
+    *POSE_COLUMNS,
+    "keyframe",
+    "n_candidates",
+    "anchor",
+    "gap_frames",
+    "E_t_m",
+    "E_q_deg",
+    "E_p",
+)
+
+POSES_FILE = "poses.csv"
 OBSERVATIONS_FILE = "observations.npz"
 # Overlay frames shown in the report.
 STRIP_FRAMES = 12
@@ -77,6 +94,38 @@ def evaluate_folder(folder: Path, truth: Path | None = None) -> None:
     write_tables(folder, log)
     write_json(folder / METRICS_FILE, figures)
     _report(folder, log, figures, paint_overlay(folder, source, log, video=False) if source else [])
+
+
+def write_tables(path: Path, log: RunLog) -> None:
+    """``poses.tum`` and ``poses.csv`` of a finished run."""
+    errors = pose_errors(log.T_est, log.T_true)
+    with (path / "poses.tum").open("w", encoding="utf-8", newline="") as tum:
+        for i in np.flatnonzero(log.has_output):
+            tum.write(tum_line(int(log.stamp_ns[i]), log.pose_rows[i]))
+    with (path / POSES_FILE).open("w", encoding="utf-8", newline="") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(CSV_COLUMNS)
+        for i in range(len(log)):
+            pose = log.pose_rows[i] if log.has_output[i] else np.full(7, np.nan)
+            table.writerow(
+                (
+                    int(log.stamp_ns[i]),
+                    TrackState(int(log.state[i])).name,
+                    *_cells(pose),
+                    int(log.keyframe[i]),
+                    len(log.candidates[i]),
+                    int(log.anchor[i]),
+                    int(log.gap_frames[i]),
+                    *_cells((errors.translation_m[i], np.degrees(errors.rotation_rad[i]), errors.pose[i])),
+                )
+            )
+
+
+def read_errors(folder: Path) -> Float:
+    """(N, 3) E_t in metres, E_q in degrees, E_p of every frame, as :func:`write_tables` wrote them; NaN: none."""
+    with (folder / POSES_FILE).open(newline="", encoding="utf-8") as file:
+        rows = [[row[key] for key in ("E_t_m", "E_q_deg", "E_p")] for row in csv.DictReader(file)]
+    return np.array([[float(cell) if cell else np.nan for cell in row] for row in rows]).reshape(-1, 3)
 
 
 def plot_folder(folder: Path, out: Path, form: str) -> list[Path]:
@@ -157,3 +206,8 @@ def _frame_rate(log: RunLog) -> float:
     """Frames per second of the recording, within what players accept."""
     period_s = float(np.median(np.diff(log.stamp_ns))) * 1e-9 if len(log) > 1 else 0.1
     return float(np.clip(1.0 / period_s, 1.0, 60.0))
+
+
+def _cells(values: Iterable[float]) -> list[str]:
+    """Numbers in full precision, an empty cell for NaN."""
+    return ["" if np.isnan(value) else repr(float(value)) for value in values]

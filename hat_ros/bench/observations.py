@@ -1,30 +1,31 @@
-"""Stages 3 and 4 alone over recorded observations: what ``hat temporal`` runs.
+"""Recorded observations: what the front ends saw of a sequence, as arrays in an ``.npz`` file.
 
-Front ends are expensive and temporal settings are not: with the candidates and SLAM poses of a sequence on disk, a
-sweep needs only this. The stages are the very objects of the tracker, without a refiner (there are no images).
+Front ends are expensive and temporal settings are not: with the candidates and SLAM poses of a sequence on disk,
+``hat temporal`` runs Stages 3 and 4 alone. ``hat track --mode observe`` records them.
 """
 
 from __future__ import annotations
 
 import os
 import zipfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from hat_ros.array_types import Bool, Float, Int
-from hat_ros.bench.methods.smoothing import solve_offline
-from hat_ros.config import HatConfig
-from hat_ros.core.fusion import FusionStage
+from hat_ros.array_types import Bool, Float
 from hat_ros.core.guard import candidates_from_recording, guard_candidates
-from hat_ros.core.published_fusion import PublishedFusion
-from hat_ros.core.selector import SelectorStage
+from hat_ros.core.selector import box_area_px
 from hat_ros.errors import CandidateError, InputError
 from hat_ros.geometry import lie
-from hat_ros.types import Camera, Candidates, Frame, Motion, TrackState
+from hat_ros.io.run_log import RunLog
+from hat_ros.types import Candidates, Motion
 
 MAX_UNPACKED_BYTES = 4 << 30
+
+_HALF_TURN = np.diag([1.0, -1.0, -1.0])
+# Far below any score of an estimator.
+_PADDING_SCORE = 1e6
 
 
 @dataclass(frozen=True)
@@ -98,70 +99,6 @@ class Observations:
             raise CandidateError(f"frame {frame}, {error}") from None
 
 
-@dataclass(frozen=True)
-class TemporalResult:
-    """The causal answer for N frames.
-
-    Attributes:
-        T_cam_target: (N, 4, 4) output, NaN before the first; the last valid pose where ``held``.
-        chosen: (N,) int, index of the anchor among the recorded candidates, -1 where there is none.
-        accepted: (N,) bool, the decoder's own proposal became the anchor: warm-up over, running gate open.
-        resets: (M,) int, frames at which the alignment was dropped.
-        held: (N,) bool, no output was possible and the last one (or its gap-filled successor) stands in.
-    """
-
-    T_cam_target: Float
-    chosen: Int
-    accepted: Bool
-    resets: Int
-    held: Bool
-
-
-def run_temporal(observations: Observations, config: HatConfig) -> TemporalResult:
-    """Run Stages 3 and 4 over recorded observations.
-
-    A pose is given for every frame after the first anchor, however long ago it was: being LOST is a matter for those
-    who act on poses, not for comparing them.
-
-    Raises:
-        CandidateError: a candidate at a keyframe is malformed and ``hypotheses.guard`` is off.
-    """
-    n = len(observations)
-    config = replace(config, fusion=replace(config.fusion, coast_limit_frames=n))
-    selector, fusion = SelectorStage(config.selector), FusionStage(config, PublishedFusion(config))
-    T_cam_target, held = np.full((n, 4, 4), np.nan), np.zeros(n, dtype=bool)
-    chosen, accepted, n_resets = np.full(n, -1), np.zeros(n, dtype=bool), np.zeros(n + 1, dtype=int)
-    for t in range(n):
-        motion = observations.motion(t)
-        selection = selector.update(observations.candidates(t, config.hypotheses.guard), motion)
-        estimate = fusion.update(_imageless_frame(t), None, motion, selection)
-        if estimate.state.has_pose:
-            T_cam_target[t], held[t] = estimate.T_cam_target, estimate.state == TrackState.COASTING
-        chosen[t], accepted[t], n_resets[t + 1] = selection.selected, selector.accepted, estimate.n_resets
-    return TemporalResult(T_cam_target, chosen, accepted, np.flatnonzero(np.diff(n_resets)), held)
-
-
-def run_offline(observations: Observations, config: HatConfig) -> TemporalResult:
-    """The whole-clip solution of the same observations, not causal (:mod:`hat_ros.bench.methods.smoothing`).
-
-    ``accepted`` marks the anchors that counted; there are no resets, and nothing is said to be held.
-
-    Raises:
-        CandidateError: as in :func:`run_temporal`.
-    """
-    n = len(observations)
-    candidates = [observations.candidates(t, config.hypotheses.guard) for t in range(n)]
-    result = solve_offline(candidates, [observations.motion(t) for t in range(n)], config)
-    accepted = result.gate_weight == 1.0
-    no_resets, not_held = np.zeros(0, dtype=np.int64), np.zeros(n, dtype=bool)
-    return TemporalResult(result.T_cam_target, result.chosen, accepted, no_resets, not_held)
-
-
-def _imageless_frame(index: int) -> Frame:
-    """A frame of which only the stamp is ever read."""
-    return Frame(index + 1, np.zeros((1, 1, 3), dtype=np.uint8), Camera(np.eye(3), 1, 1))
-
-
 def load_observations(path: str | os.PathLike[str]) -> Observations:
     """Read an ``.npz`` file with the arrays of :class:`Observations`; further arrays in it are not read.
 
@@ -192,20 +129,35 @@ def load_observations(path: str | os.PathLike[str]) -> Observations:
         raise InputError(f"{path}: {error}") from None
 
 
-def save_result(path: str | os.PathLike[str], result: TemporalResult) -> None:
-    """Write the result as ``.npz``, whole or not at all.
+def observations_of(log: RunLog) -> Observations:
+    """The same observations in the form that ``hat temporal`` reads.
 
-    Raises:
-        InputError: the folder does not exist or cannot be written.
+    That form has one SLAM gauge and the same K everywhere. So only the longest SLAM epoch keeps its motion, and
+    frames with fewer candidates are filled up with ones that can neither win nor support another: turned away from
+    the best one by 180 degrees, with a score far below all others.
     """
-    path = Path(path)
-    partial = path.with_name(path.name + ".partial")
-    try:
-        with partial.open("wb") as file:
-            np.savez(file, **vars(result))
-        partial.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from None
+    k = max((len(group) for group in log.candidates), default=1) or 1
+    poses = np.tile(np.eye(4), (len(log), k, 1, 1))
+    scores = np.zeros((len(log), k))
+    area_px = np.full(len(log), np.nan)
+    for i, group in enumerate(log.candidates):
+        if len(group):
+            area_px[i] = box_area_px(group.box_xyxy)
+            poses[i] = group.T_cam_target[0] @ lie.transform(_HALF_TURN, np.zeros(3))
+            scores[i] = group.log_score.min() - _PADDING_SCORE
+            poses[i, : len(group)], scores[i, : len(group)] = group.T_cam_target, group.log_score
+    epochs, counts = np.unique(log.slam_epoch[log.motion_valid], return_counts=True)
+    longest = epochs[np.argmax(counts)] if len(epochs) else -1
+    usable = log.motion_valid & (log.slam_epoch == longest)
+    slam = np.full((len(log), 4, 4), np.nan)
+    slam[usable] = lie.matrix_from_row(log.motion_rows[usable])
+    return Observations(slam, np.array([len(group) > 0 for group in log.candidates]), poses, scores, area_px)
+
+
+def save_observations(path: Path, log: RunLog) -> None:
+    """Write :func:`observations_of` as an ``.npz`` file."""
+    with path.open("wb") as file:
+        np.savez_compressed(file, **vars(observations_of(log)))
 
 
 def _require(holds: bool, name: str, expectation: str) -> None:
