@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 
 from hat_ros import __version__
-from hat_ros.cli import analyse, bench, data, run, system
+from hat_ros.cli import analyse, bench, config, data, run, system
 from hat_ros.errors import HatError, InputError
 
 EXIT_INTERRUPTED = 130
@@ -35,7 +35,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for group in (run, data, analyse, bench, system):
+    for group in (run, data, analyse, bench, config, system):
         group.add_commands(commands)
     return parser
 

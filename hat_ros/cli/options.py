@@ -24,6 +24,11 @@ def add_config(parser: argparse.ArgumentParser, default: str = "default") -> Non
         metavar="NAME|FILE",
         help=f"preset name or YAML file (default: {default})",
     )
+    add_overrides(parser)
+
+
+def add_overrides(parser: argparse.ArgumentParser) -> None:
+    """``--set``."""
     parser.add_argument(
         "--set",
         dest="overrides",

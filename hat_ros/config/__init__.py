@@ -1,7 +1,8 @@
 """The configuration.
 
 :mod:`~hat_ros.config.schema` says what there is (its sections are in :mod:`~hat_ros.config.front_ends` and
-:mod:`~hat_ros.config.estimation`), :mod:`~hat_ros.config.loader` reads it.
+:mod:`~hat_ros.config.estimation`), :mod:`~hat_ros.config.loader` reads it and
+:mod:`~hat_ros.config.text` writes it with comments.
 """
 
 from hat_ros.config.estimation import (
@@ -34,6 +35,7 @@ from hat_ros.config.loader import (
 )
 from hat_ros.config.option import LEVELS, Level, describe
 from hat_ros.config.schema import GraphConfig, HatConfig, NetsConfig
+from hat_ros.config.text import commented_yaml, differences, value_text
 
 __all__ = [
     "LEVELS",
@@ -57,11 +59,14 @@ __all__ = [
     "SelectorConfig",
     "SlamConfig",
     "TemplateConfig",
+    "commented_yaml",
     "config_from_dict",
     "config_to_dict",
     "describe",
+    "differences",
     "flat_options",
     "load_config",
     "preset_folder",
     "preset_names",
+    "value_text",
 ]

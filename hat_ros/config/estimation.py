@@ -26,7 +26,7 @@ class SelectorConfig:
         0.3, "penalty per degree of disagreement with the motion", level="paper", symbol="mu", unit="1/deg", low=0
     )
     max_motion_penalty: float = option(
-        8.0, "limit of that penalty: earlier candidates may be wrong; 0: none, as published", low=0
+        8.0, "limit of the motion penalty: earlier candidates may be wrong; 0: none, as published", low=0
     )
     max_turn_deg_per_frame: float = option(
         5.0, "turn that costs nothing where motion is missing; 0: any, as published", unit="deg/frame", low=0

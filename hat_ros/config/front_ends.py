@@ -163,7 +163,7 @@ class DroidConfig:
     )
     readout_depths: bool = option(
         False,
-        "let these updates move the depths of the last two keyframes too; helps where new surface turns into view",
+        "motion-only updates move the depths of the last two keyframes; helps where new surface turns into view",
     )
     as_released: bool = option(
         True,

@@ -88,6 +88,15 @@ def config_to_dict(config: HatConfig) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
+def parse_value(text: str) -> object:
+    """A value as it stands in a file or after ``--set key=``.
+
+    Raises:
+        YAMLError: it is not valid YAML.
+    """
+    return yaml.load(text, _Loader)
+
+
 def flat_options(
     section: DataclassInstance | None = None, prefix: str = ""
 ) -> dict[str, tuple[Value, dataclasses.Field[Any]]]:
@@ -117,6 +126,8 @@ def _read(name_or_file: str, readers: tuple[str, ...]) -> dict[str, Any]:
     try:
         with path.open(encoding="utf-8") as stream:
             data = yaml.load(stream, _Loader)
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
     if data is None:
@@ -152,7 +163,7 @@ def _apply_override(data: dict[str, Any], override: str) -> None:
         if not isinstance(node, dict):
             raise ConfigError(f"override '{override}': '{section}' is a value, not a section")
     try:
-        node[last] = yaml.load(value, _Loader)
+        node[last] = parse_value(value)
     except yaml.YAMLError:
         raise ConfigError(f"override '{override}': the value is not valid YAML") from None
 

@@ -32,7 +32,7 @@ class NetsConfig:
     device: str = option("auto", "auto (cuda if there is one), cpu, cuda or cuda:N", level="basic")
     precision: str = option(
         "auto",
-        "of networks on cuda: auto (as released: DROID float16, others float32), float32, float16 or bfloat16",
+        "precision on cuda: auto (as released: DROID float16, others float32), float32, float16 or bfloat16",
         level="basic",
         choices=("auto", "float32", "float16", "bfloat16"),
     )

@@ -15,7 +15,19 @@ from hat_ros.errors import RunError
 from hat_ros.geometry import lie
 from hat_ros.io.bag_writer import BagWriter
 
-COMMANDS = ("replay", "track", "temporal", "import", "synth", "evaluate", "plot", "bench", "weights", "doctor")
+COMMANDS = (
+    "replay",
+    "track",
+    "temporal",
+    "import",
+    "synth",
+    "evaluate",
+    "plot",
+    "bench",
+    "config",
+    "weights",
+    "doctor",
+)
 
 
 @pytest.fixture
