@@ -5,12 +5,12 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 PYTEST := ROS_PYTHON_CHECK_FIELDS=1 $(BIN)/python -m pytest
 
-.PHONY: help demo test test-accuracy test-slow test-gpu lint types wheel-check wheel-oldest wheel-newest colcon-check \
-  install install-nets install-test clean
+.PHONY: help demo test test-accuracy test-slow test-gpu mutation lint types count docs wheel-check wheel-oldest \
+  wheel-newest colcon-check install install-nets install-test clean
 .DELETE_ON_ERROR:
 
 help:  ## this list
-	@sed -nE 's/^([a-z-]+):.*## (.*)/\1 | \2/p' $(MAKEFILE_LIST) | column -t -s '|'
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: install  ## replay bags/demo through the five-node graph, print errors, write bag, overlay and report
 	$(BIN)/hat replay bags/demo --out out/demo --overwrite
@@ -27,12 +27,21 @@ test-slow: install-test  ## tests that take minutes each
 test-gpu: install-test  ## tests that need an accelerator
 	$(PYTEST) -m gpu
 
+mutation: install-test  ## does the accuracy gate see changed constants? stage by stage, an hour
+	$(BIN)/python tools/mutate.py
+
 lint: install-test  ## ruff: rules and format
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
 types: install-test  ## mypy over the package
 	$(BIN)/mypy
+
+count: install  ## rooms, arrows, lines, constants and keys of what the default preset imports
+	$(BIN)/python tools/count.py
+
+docs: $(VENV)/.docs  ## the site of docs/ into build/site; a warning fails
+	$(BIN)/mkdocs build --strict --quiet
 
 wheel-check: install  ## sdist, wheel, empty environment with the pinned versions: track and replay a clip
 	PYTHON=$(PYTHON) tools/check_wheel.sh pinned
@@ -56,9 +65,12 @@ $(VENV)/bin/python:
 	@$(PYTHON) -m venv $(VENV) || \
 	  { rm -rf $(VENV); echo "creating .venv failed: on Debian and Ubuntu, apt install python3-venv" >&2; exit 2; }
 
+# Without dependencies of their own, then checked: a package that is not pinned cannot slip in. torch is the exception,
+# since what it needs differs between its builds.
 $(VENV)/.base: requirements.txt pyproject.toml setup.py | $(VENV)/bin/python
-	$(PIP) -r requirements.txt
+	$(PIP) --no-deps -r requirements.txt
 	$(PIP) --no-deps --no-build-isolation -e .
+	$(BIN)/python -m pip check --disable-pip-version-check
 	@touch $@
 
 $(VENV)/.nets: $(VENV)/.base requirements-nets.txt
@@ -66,7 +78,13 @@ $(VENV)/.nets: $(VENV)/.base requirements-nets.txt
 	@touch $@
 
 $(VENV)/.test: $(VENV)/.nets requirements-test.txt
-	$(PIP) -r requirements-test.txt
+	$(PIP) --no-deps -r requirements-test.txt
+	$(BIN)/python -m pip check --disable-pip-version-check
+	@touch $@
+
+$(VENV)/.docs: $(VENV)/.base requirements-docs.txt
+	$(PIP) --no-deps -r requirements-docs.txt
+	$(BIN)/python -m pip check --disable-pip-version-check
 	@touch $@
 
 clean:  ## remove .venv and everything made

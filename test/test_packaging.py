@@ -50,6 +50,7 @@ def names(requirements):
 
 
 def requirements(*files):
+    """Name -> requirement, of all files together."""
     lines = [line.split("#")[0].strip() for file in files for line in (ROOT / file).read_text().splitlines()]
     return {canonicalize_name(Requirement(line).name): Requirement(line) for line in lines if line}
 
@@ -94,6 +95,15 @@ def test_pins_lie_within_the_bounds():
         (pin,) = pins[canonicalize_name(need.name)].specifier
         assert pin.operator == "=="
         assert pin.version in need.specifier, f"{need} is pinned to {pin.version}"
+
+
+def test_a_package_has_one_pin():
+    pins = {}
+    for path in ROOT.glob("requirements*.txt"):
+        for name, pin in requirements(path.name).items():
+            if str(pin.specifier).startswith("=="):
+                pins.setdefault(name, set()).add(str(pin.specifier))
+    assert {name: found for name, found in pins.items() if len(found) > 1} == {}
 
 
 def test_ros_machines_get_every_dependency():
