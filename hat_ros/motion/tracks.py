@@ -120,7 +120,7 @@ def follow(previous: UInt8, current: UInt8, xy: Float, xy_guess: Float) -> tuple
     }
     moved, ok, _ = cv2.calcOpticalFlowPyrLK(before, after, start, guess, maxLevel=_LEVELS, **options)
     back, ok_back, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, start.copy(), maxLevel=0, **options)
-    found = (ok[:, 0] > 0) & (ok_back[:, 0] > 0) & (np.linalg.norm(back - start, axis=1) < _BACKWARD_TOLERANCE_PX)
+    found = (ok.ravel() > 0) & (ok_back.ravel() > 0) & (np.linalg.norm(back - start, axis=1) < _BACKWARD_TOLERANCE_PX)
     size = np.array([x1 - x0, y1 - y0])
     found &= ((moved >= 0) & (moved <= size - 1)).all(axis=1)
     return moved.astype(np.float64) + origin, found
@@ -150,7 +150,7 @@ def detect(image: UInt8, region: UInt8, taken: Float, count: int, spacing_px: fl
     corners = cv2.goodFeaturesToTrack(crop, count, _CORNER_QUALITY, spacing_px, mask=free, blockSize=5)
     if corners is None:
         return np.zeros((0, 2))
-    return corners[:, 0].astype(np.float64) + np.array([x, y])
+    return corners.reshape(-1, 2).astype(np.float64) + np.array([x, y])
 
 
 @njit(cache=True)

@@ -43,7 +43,9 @@ def refine_outline(rgb: UInt8, mask: UInt8, band_px: int, contrast: float) -> UI
         step = 2
     inside, outside = _area_table(examples, known_inside), _area_table(examples, known_outside)
     reach, least = (2 * band_px + 2) // step, max(1, _MIN_PIXELS // step**2)
-    moved = _decide(rgb, mask, open_xy[:, 0], *inside, *outside, step, reach, least, np.float32(contrast * contrast))
+    moved = _decide(
+        rgb, mask, open_xy.reshape(-1, 2), *inside, *outside, step, reach, least, np.float32(contrast * contrast)
+    )
     # A lone pixel that disagrees with most of its neighbours is noise.
     smooth = cv2.medianBlur(moved, 3)
     return np.where(inner == outer, mask, smooth)

@@ -41,7 +41,7 @@ _SHOWN = 0.3  # share of a mask that is unlike the ground
 _CONTRADICTED = 0.5  # share that is ground
 CLEAR = 0.9  # from so many lengths back none of the target is where it is now
 
-_NO_POINTS = np.zeros((0, 1, 2), np.float32)
+_NO_POINTS = np.zeros((0, 2), np.float32)
 _NO_MOTION = np.zeros((0, 3, 3))
 _STANDSTILL = np.eye(3)[None]
 _K3 = np.ones((3, 3), np.uint8)
@@ -129,15 +129,16 @@ class GroundMemory:
         """(3, 3) homography that most point tracks follow into the next frame outside the target; None without one."""
         free, points = self._frames[-1].free, self._points
         if len(points):
-            x, y = np.rint(points[:, 0]).astype(int).T
+            x, y = np.rint(points).astype(int).T
             inside = (x >= 0) & (y >= 0) & (x < free.shape[1]) & (y < free.shape[0])
             points = points[inside]
             points = points[free[y[inside], x[inside]] > 0]
         if len(points) <= max(_MIN_POINTS, _FEW_POINTS * self._n_chosen):
-            points = cv2.goodFeaturesToTrack(self._grey, _MAX_POINTS, _POINT_QUALITY, _POINT_SPACING_PX, mask=free)
-            self._n_chosen = 0 if points is None else len(points)
+            corners = cv2.goodFeaturesToTrack(self._grey, _MAX_POINTS, _POINT_QUALITY, _POINT_SPACING_PX, mask=free)
+            points = _NO_POINTS if corners is None else corners.reshape(-1, 2)
+            self._n_chosen = len(points)
         self._points = _NO_POINTS
-        if points is None or len(points) < _MIN_POINTS:
+        if len(points) < _MIN_POINTS:
             return None
         patch = (_TRACK_PX, _TRACK_PX)
         tracked, found, _ = cv2.calcOpticalFlowPyrLK(self._grey, grey, points, None, winSize=patch, maxLevel=2)

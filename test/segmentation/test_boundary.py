@@ -46,3 +46,14 @@ def test_pixels_outside_the_band_never_change():
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
     band = cv2.dilate(start, kernel) != cv2.erode(start, kernel)
     assert np.array_equal(found[~band], start[~band])
+
+
+@pytest.mark.parametrize("shape", [(-1, 1, 2), (-1, 2)], ids=["OpenCV 4", "OpenCV 5"])
+def test_both_shapes_of_a_point_list_give_the_same_outline(shape, monkeypatch):
+    picture, _ = disc(35.0)
+    _, start = disc(37.0)
+    expected = refine_outline(picture, start, 4, 8.0)
+    find = cv2.findNonZero
+    monkeypatch.setattr(cv2, "findNonZero", lambda image: find(image).reshape(shape))
+    assert (refine_outline(picture, start, 4, 8.0) == expected).all()
+    assert (expected != start).any()
