@@ -14,7 +14,7 @@ PACKAGE = Path(hat_ros.__file__).parent
 # Each room may import itself and the rooms before it.
 FLOORS = (
     ("errors", "array_types"),
-    ("geometry", "cache"),
+    ("geometry", "cache", "spans"),
     ("types",),
     ("config",),
     ("target", "core"),

@@ -25,6 +25,7 @@ from hat_ros.nets.droid_ba import (
     bundle_adjust,
 )
 from hat_ros.nets.droid_geometry import frame_distance, pixel_grid, reproject
+from hat_ros.spans import span
 
 Index = Int
 Pairs = Int
@@ -268,18 +269,19 @@ class FactorGraph:
         if not motion_only:
             frames.eta.index_copy_(0, plan.sources, self.model.damping(self.hidden, plan.group, len(plan.sources)))
             eta = frames.eta[plan.layout.frames]
-        frames.poses, frames.disparities = bundle_adjust(
-            frames.poses,
-            frames.disparities,
-            frames.intrinsics,
-            torch.cat([plan.target_inactive, self.target]),
-            torch.cat([plan.weight_inactive, self.weight]),
-            plan.layout,
-            eta=eta,
-            damping=damping,
-            rule=self.rule,
-            motion_only=motion_only,
-        )
+        with span("bundle adjustment"):
+            frames.poses, frames.disparities = bundle_adjust(
+                frames.poses,
+                frames.disparities,
+                frames.intrinsics,
+                torch.cat([plan.target_inactive, self.target]),
+                torch.cat([plan.weight_inactive, self.weight]),
+                plan.layout,
+                eta=eta,
+                damping=damping,
+                rule=self.rule,
+                motion_only=motion_only,
+            )
         self.age = self.age + 1
 
     def _planned(self, first: int | None, use_inactive: bool) -> _UpdatePlan:

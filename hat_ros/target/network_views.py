@@ -16,6 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from hat_ros.array_types import Float, Float32, Int, Int32, UInt8
+from hat_ros.spans import span
 from hat_ros.target.model import Target
 from hat_ros.target.raster import edge_functions, nearest_faces
 
@@ -40,11 +41,13 @@ class NetworkViewRenderer:
 
     def render(self, T_cam_target: Float, K: Float, size: tuple[int, int]) -> NDArray:
         """One view: (4, 4), (3, 3) with pixel centres at +0.5, (width, height) -> (H, W, 6) uint8 RGB + normals."""
-        return self._view(T_cam_target, K, size)
+        with span("renders"):
+            return self._view(T_cam_target, K, size)
 
     def render_many(self, T_cam_target: Float, K: Float, size: tuple[int, int]) -> UInt8:
         """Views of (N, 4, 4) poses by (N, 3, 3) cameras of one size: (N, H, W, 6), see :meth:`render`."""
-        views = list(self._pool.map(self._view, T_cam_target, K, [size] * len(K)))
+        with span("renders", len(K)):
+            views = list(self._pool.map(self._view, T_cam_target, K, [size] * len(K)))
         return np.stack(views) if views else np.zeros((0, size[1], size[0], 6), np.uint8)
 
     def _view(self, T_cam_target: Float, K: Float, size: tuple[int, int]) -> NDArray:

@@ -1,4 +1,4 @@
-"""What is counted and timed: calls from outside, nothing left behind, and the passes and renders of MegaPose."""
+"""What a profile says: every frame attributed, and the passes and renders of MegaPose."""
 
 import json
 import sys
@@ -6,14 +6,14 @@ import sys
 import numpy as np
 import pytest
 
-from hat_ros.bench.experiments.profile import PARTS, Meter, Part, parts_of, profile
+from hat_ros.app.pipeline import STAGE_NAMES
+from hat_ros.bench.experiments.profile import profile
 from hat_ros.bench.source import open_source
 from hat_ros.bench.synth.clips import ClipSpec
 from hat_ros.bench.synth.suite import Clip, synthesize
 from hat_ros.cli import main
 from hat_ros.config import load_config
 from hat_ros.errors import MissingDependencyError, UsageError
-from hat_ros.segmentation.stage import SegmentationStage
 
 N_FRAMES, GAP = 7, 3
 
@@ -24,72 +24,23 @@ def clip(tmp_path_factory):
     return synthesize(Clip("observer", spec), tmp_path_factory.mktemp("profile") / "clip", False)
 
 
-class Base:
-    def work(self, batch):
-        return len(batch)
-
-
-class Derived(Base):
-    pass
-
-
-def double(batch, factor=2):
-    if factor < 0:
-        raise ValueError("negative")
-    return factor * len(batch)
-
-
-def test_calls_and_images_are_counted_and_everything_is_put_back():
-    waits = []
-    parts = (
-        Part("method", f"{__name__}:Derived.work", 0),
-        Part("function", f"{__name__}:double", 0),
-    )
-    plain = double
-    with Meter(parts, lambda: waits.append(1)) as meter:
-        assert Derived().work("abc") == 3
-        assert globals()["double"](["ab", "cd"], factor=3) == 6
-        with pytest.raises(ValueError, match="negative"):
-            globals()["double"]("ab", factor=-1)
-        assert Base().work("a") == 1, "the base class itself is not measured"
-        tallies = meter.take()
-        assert not any(tally.calls for tally in meter.take().values())
-    assert (tallies["method"].calls, tallies["method"].images) == (1, 3)
-    assert (tallies["function"].calls, tallies["function"].images) == (2, 4)
-    assert tallies["function"].seconds > 0 and len(waits) == 6
-    assert double is plain and "work" not in Derived.__dict__
-
-
-def test_a_missing_package_is_one_sentence_and_nothing_is_left_wrapped(monkeypatch):
-    before = SegmentationStage.update
+def test_a_missing_package_is_one_sentence(clip, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
-    parts = (
-        Part("stage", "hat_ros.segmentation.stage:SegmentationStage.update"),
-        Part("gone", "torch:nn.Module.forward"),
-    )
-    with pytest.raises(MissingDependencyError, match=r"'torch'.*make install-nets"), Meter(parts, lambda: None):
-        pass
-    assert SegmentationStage.update is before
-
-
-@pytest.mark.parametrize("backend", PARTS)
-def test_every_part_exists(backend):
-    pytest.importorskip("torch")
-    with Meter(PARTS[backend], lambda: None) as meter:
-        assert list(meter.take()) == [part.name for part in PARTS[backend]]
+    config = load_config("default", ["hypotheses.backend=megapose"])
+    with pytest.raises(MissingDependencyError, match=r"'torch'.*make install-nets"):
+        profile(open_source(clip), config)
 
 
 def test_stages_of_every_frame_are_attributed(clip):
     config = load_config("default", ["hypotheses.template.n_views=162", f"keyframes.gap_frames={GAP}"])
-    before, seen = SegmentationStage.update, []
+    seen = []
     measured = profile(open_source(clip), config, watch=lambda done, total, state: seen.append((done, total)))
-    assert SegmentationStage.update is before
     assert seen == [(index + 1, N_FRAMES) for index in range(N_FRAMES)]
     later = measured.n_keyframes + measured.n_between
     assert measured.n_keyframes >= 1 and later < N_FRAMES
     assert measured.start["segmentation"].calls + later == N_FRAMES
-    for part in parts_of(config):
-        assert measured.keyframe[part.name].calls == measured.between[part.name].calls == 1
+    for stage in STAGE_NAMES:
+        assert measured.keyframe[stage].calls == measured.between[stage].calls == 1
     assert measured.keyframe["hypotheses"].seconds > measured.between["hypotheses"].seconds
     assert measured.fps > 0 and np.isnan(measured.device_memory_mib) and measured.host_memory_mib > 1
 
@@ -121,13 +72,14 @@ def test_megapose_passes_and_renders_add_up(clip, tmp_path, monkeypatch, device)
     config = load_config("default", [f"{key}={value}" for key, value in settings.items()])
     measured = profile(open_source(clip), config, limit=GAP + 1)
     assert measured.n_keyframes == 1
-    found = {name.strip(): tally.images for name, tally in measured.keyframe.items()}
-    assert found["coarse network"] == n_grid + n_candidates
-    assert found["refiner network"] == n_candidates * n_iterations
+    found = {name: tally.images for name, tally in measured.keyframe.items()}
+    assert found["CoarseNet"] == n_grid + n_candidates
+    assert found["RefinerNet"] == n_candidates * n_iterations
     assert found["renders"] == n_candidates * (4 * n_iterations + 1)
-    assert found["crops"] == found["coarse network"] + found["refiner network"]
-    assert measured.start["  renders"].images == found["renders"] + n_grid, "the grid is rendered once"
-    assert measured.between["  coarse network"].calls == 0
+    assert measured.start["renders"].images == found["renders"] + n_grid, "the grid is rendered once"
+    assert "CoarseNet" not in measured.between
+    shown = [row["part"] for row in measured.table().rows]
+    assert shown[shown.index("hypotheses") + 1 :][:3] == ["  renders", "  CoarseNet", "  RefinerNet"]
     assert np.isnan(measured.device_memory_mib) if device == "cpu" else measured.device_memory_mib > 1
 
 
