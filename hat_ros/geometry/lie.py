@@ -37,7 +37,7 @@ def so3_exp(rotvec: Float) -> Float:
     """Rotation matrix of a rotation vector (eq. 132): (..., 3) -> (..., 3, 3)."""
     rotvec = np.asarray(rotvec, dtype=np.float64)
     if rotvec.ndim == 1:
-        return _so3_exp_single(rotvec)
+        return np.array(rotation_entries(*rotvec.tolist(), _SMALL_ANGLE_SQ)).reshape(3, 3)
     angle_sq = np.sum(rotvec * rotvec, axis=-1)
     small = angle_sq < _SMALL_ANGLE_SQ
     safe = np.where(small, 1.0, angle_sq)
@@ -171,21 +171,26 @@ def is_rigid(T: Float, tolerance: float = 1e-4) -> Bool:
 # numpy's overhead. Same formulas on plain floats, agreeing with the batched ones to the last bit or two.
 
 
-def _so3_exp_single(rotvec: Float) -> Float:
-    x, y, z = rotvec.tolist()
+def rotation_entries(x: float, y: float, z: float, small_angle_sq: float) -> tuple[float, ...]:
+    """The nine entries, row by row, of the rotation matrix of a rotation vector.
+
+    Plain arithmetic: :mod:`hat_ros.geometry.linear` compiles this very function for the inner loops.
+
+    Args:
+        x, y, z: rotation vector, radians.
+        small_angle_sq: squared angle below which the series is taken.
+    """
     angle_sq = x * x + y * y + z * z
-    if angle_sq < _SMALL_ANGLE_SQ:
+    if angle_sq < small_angle_sq:
         a, b = 1.0 - angle_sq / 6.0, 0.5 - angle_sq / 24.0
     else:
         angle = math.sqrt(angle_sq)
         a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle_sq
-    return np.array(
-        [
-            [1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
-            [b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x],
-            [b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)],
-        ]
-    )
+    return (
+        1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y,
+        b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x,
+        b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y),
+    )  # fmt: skip
 
 
 def _quat_from_matrix_single(R: Float) -> Float:

@@ -6,23 +6,17 @@ import numpy as np
 from numba import njit
 
 from hat_ros.array_types import Float
+from hat_ros.geometry import lie
+
+# The solvers' steps end far below a hundredth of a degree; where the series begins decides on the last bits of a pose.
+_SMALL_ANGLE_SQ = 1e-12
+_rotation_entries = njit(cache=True, nogil=True)(lie.rotation_entries)
 
 
 @njit(cache=True, nogil=True)
 def rotation(v: Float) -> Float:
     """Rotation matrix (3, 3) of a rotation vector (3,) in radians."""
-    s = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
-    if s < 1e-12:
-        a, b = 1.0 - s / 6.0, 0.5 - s / 24.0
-    else:
-        angle = np.sqrt(s)
-        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / s
-    x, y, z = v[0], v[1], v[2]
-    R = np.empty((3, 3))
-    R[0, 0], R[0, 1], R[0, 2] = 1 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
-    R[1, 0], R[1, 1], R[1, 2] = b * x * y + a * z, 1 - b * (x * x + z * z), b * y * z - a * x
-    R[2, 0], R[2, 1], R[2, 2] = b * x * z - a * y, b * y * z + a * x, 1 - b * (x * x + y * y)
-    return R
+    return np.array(_rotation_entries(v[0], v[1], v[2], _SMALL_ANGLE_SQ)).reshape(3, 3)
 
 
 @njit(cache=True, nogil=True)

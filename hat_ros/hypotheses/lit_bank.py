@@ -16,19 +16,14 @@ from numpy.typing import NDArray
 
 from hat_ros.array_types import Float, Float32
 from hat_ros.cache import cached_arrays
+from hat_ros.geometry.masks import image_moments
 from hat_ros.refinement.sunlight import brightness
 from hat_ros.refinement.view import Surfels, TargetViewer
 from hat_ros.target.contour import COL_NU, COL_NV, COL_U, COL_V, COL_WEIGHT, contour_table
+from hat_ros.target.polar import MAX_RADIUS, N_RINGS, polar_grid
 from hat_ros.target.rays import pixel_rays
-from hat_ros.target.view_bank import (
-    CONTOUR_POINTS,
-    MAX_RADIUS,
-    N_RINGS,
-    ViewBank,
-    image_moments,
-    polar_grid,
-    view_rotations,
-)
+from hat_ros.target.sphere import look_inwards
+from hat_ros.target.view_bank import CONTOUR_POINTS, ViewBank
 from hat_ros.types import Camera
 
 _FORMAT = 2
@@ -82,7 +77,7 @@ def build_lit(viewer: TargetViewer, n_angles: int) -> LitBank:
     distance = _DISTANCE_RADII * viewer.target.bounding_radius_m
     suns = sun_directions()
     R_all, sun_all, described, contours = [], [], [], []
-    for R in view_rotations(_N_VIEWS):
+    for R in look_inwards(_N_VIEWS):
         view = _OneView(viewer, R, distance)
         for sun in suns:
             image = view.image(sun)
@@ -145,7 +140,7 @@ class _OneView:
 
 def _describe(image: Float32, camera: Camera, n_angles: int) -> tuple[NDArray[np.complex64], Float, float]:
     """Spectrum (F, rings) of unit norm, centroid and radius of gyration in tangent units."""
-    center_px, gyration_px = image_moments(image)
-    grid = polar_grid(image, center_px, gyration_px, n_angles)
+    moments = image_moments(image)
+    grid = polar_grid(image, moments.center_px, moments.gyration_px, n_angles)
     spectrum = np.fft.rfft(grid / np.linalg.norm(grid), axis=0).astype(np.complex64)
-    return spectrum, (center_px - camera.K[:2, 2]) / camera.K[0, 0], gyration_px / camera.K[0, 0]
+    return spectrum, (moments.center_px - camera.K[:2, 2]) / camera.K[0, 0], moments.gyration_px / camera.K[0, 0]

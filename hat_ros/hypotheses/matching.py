@@ -16,18 +16,10 @@ from numpy.typing import NDArray
 
 from hat_ros.array_types import Bool, Float, Float32
 from hat_ros.geometry import lie
+from hat_ros.geometry.masks import Moments, image_moments, mask_moments
 from hat_ros.hypotheses.lit_bank import subdued
-from hat_ros.target.view_bank import (
-    MAX_RADIUS,
-    N_RINGS,
-    PolarSampler,
-    ViewBank,
-    border_grid,
-    image_moments,
-    mask_moments,
-    polar_grid,
-    ring_weights,
-)
+from hat_ros.target.polar import MAX_RADIUS, N_RINGS, PolarSampler, border_grid, polar_grid, ring_weights
+from hat_ros.target.view_bank import ViewBank
 from hat_ros.types import Camera
 
 # What silhouette without mask costs, against mask without silhouette = 1. A part that lies in shadow or outside the
@@ -49,6 +41,11 @@ class Placement:
     center_px: Float
     gyration_px: float
 
+    @classmethod
+    def of(cls, moments: Moments) -> Placement:
+        """What an image shows is the whole silhouette."""
+        return cls(moments.center_px, moments.gyration_px)
+
 
 @dataclass(frozen=True)
 class ShapeMatches:
@@ -61,12 +58,13 @@ class ShapeMatches:
 
 def whole_placement(mask: Bool) -> list[Placement]:
     """The mask taken as the whole silhouette."""
-    return [Placement(*mask_moments(mask))]
+    return [Placement.of(mask_moments(mask))]
 
 
 def cut_placements(mask: Bool) -> list[Placement]:
     """The mask continues beyond the image border: centroids further out, larger sizes."""
-    center, gyration = mask_moments(mask)
+    moments = mask_moments(mask)
+    center, gyration = moments.center_px, moments.gyration_px
     outward = np.zeros(2)
     for pixels, direction in (
         (mask[0], (0, -1)),
@@ -82,7 +80,8 @@ def cut_placements(mask: Bool) -> list[Placement]:
 
 def partial_placements(mask: Bool) -> list[Placement]:
     """Parts of the target are missing from the mask on an unknown side."""
-    center, gyration = mask_moments(mask)
+    moments = mask_moments(mask)
+    center, gyration = moments.center_px, moments.gyration_px
     angles = np.arange(8) * (np.pi / 4)
     return [Placement(center, 1.3 * gyration)] + [
         Placement(center + shift * gyration * np.array([np.cos(a), np.sin(a)]), scale * gyration)
@@ -131,7 +130,7 @@ def match_light(
         camera, n_best, separation_deg, center_m: as for :func:`match_shape`.
     """
     light = subdued(light)
-    placement = Placement(*image_moments(light))
+    placement = Placement.of(image_moments(light))
     grid = polar_grid(light, placement.center_px, placement.gyration_px, bank.n_angles)
     norm = float(np.linalg.norm(grid))
     score = _correlate(bank, grid[None] / np.float32(norm if norm > 0 else 1.0))

@@ -15,7 +15,7 @@ from hat_ros.target.model import Target
 from hat_ros.target.network_views import NetworkViewRenderer
 from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.target.rays import pixel_rays
-from hat_ros.target.sphere import icosphere, look_at_origin
+from hat_ros.target.sphere import look_inwards_upright
 from hat_ros.types import Camera
 
 LOG = logging.getLogger(__name__)
@@ -24,6 +24,7 @@ TEMPLATE_K = np.array([[572.4114, 0.0, 320.0], [0.0, 573.57043, 240.0], [0.0, 0.
 TEMPLATE_SIZE = (640, 480)
 CROP_PX = 224
 POINT_CELLS = 64
+_N_TEMPLATES = 162
 # Focal length over distance that shows a ball of unit diameter 360 px large at the published focal length.
 _PIXELS_PER_RADIUS = 180.0
 
@@ -95,7 +96,7 @@ class Templates:
 
 def template_poses(target: Target) -> Float:
     """(162, 4, 4) poses that centre the target's box and show its bounding ball about 360 px large."""
-    R = look_at_origin(icosphere(2))
+    R = look_inwards_upright(_N_TEMPLATES)
     distance = 2 * target.bounding_radius_m * TEMPLATE_K[1, 1] / (2 * _PIXELS_PER_RADIUS)
     return lie.transform(R, np.array([0.0, 0.0, distance]) - R @ target.center_m)
 

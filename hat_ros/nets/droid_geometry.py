@@ -6,7 +6,8 @@ A pose is one row ``[tx ty tz qx qy qz qw]`` that maps world points into the cam
 Intrinsics are rows ``[fx fy cx cy]`` in units of 8 pixels.
 
 Formulas: Sola, Deray, Atchuthan, "A micro Lie theory for state estimation in robotics", arXiv:1812.01537; reprojection
-and frame distance as in DROID-SLAM (arXiv:2108.10869).
+and frame distance as in DROID-SLAM (arXiv:2108.10869). :mod:`hat_ros.geometry.lie` has the same maps in numpy; these
+run on torch's devices and in float32, whose series begin elsewhere.
 """
 
 from __future__ import annotations

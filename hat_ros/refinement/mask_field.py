@@ -11,6 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from hat_ros.array_types import Bool, Float, Float32, UInt8
+from hat_ros.geometry.masks import mask_moments
 from hat_ros.refinement.view import View
 
 # Luma at which background is bright enough to tell that no target covers it; a shadowed part is black.
@@ -58,10 +59,7 @@ class MaskField:
     @cached_property
     def centroid_px(self) -> Float:
         """(2,) centre of gravity."""
-        pixels = self.mask.view(np.uint8)
-        left, top, width, height = cv2.boundingRect(pixels)
-        moments = cv2.moments(pixels[top : top + height, left : left + width], binaryImage=True)
-        return np.array([left + moments["m10"] / self.area_px, top + moments["m01"] / self.area_px])
+        return mask_moments(self.mask).center_px
 
     @cached_property
     def _depth_counts(self) -> NDArray[np.intp]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from hat_ros.array_types import Bool, Float, Float32, UInt8
 from hat_ros.refinement.view import Surfels, TargetViewer, View
+from hat_ros.target.sphere import even_directions
 
 # Points of the surface along the longer side of what is compared.
 _SIDE_POINTS = 48
@@ -88,7 +89,7 @@ class SunMatcher:
 
     def __init__(self, viewer: TargetViewer) -> None:
         self._viewer = viewer
-        suns = _even_directions(_N_SUNS)
+        suns = even_directions(_N_SUNS)
         self._suns = suns[suns[:, 2] < _MAX_BEHIND].astype(np.float32)
         self._encoded = brightness(np.linspace(0.0, 1.0, 257, dtype=np.float32))
         self._rehearse()
@@ -145,15 +146,6 @@ class SunMatcher:
 def brightness(cosine: Float32) -> Float32:
     """Encoded brightness of a white face over the cosine of the sun's incidence."""
     return (cosine + np.float32(_AMBIENT)) ** np.float32(_GAMMA)
-
-
-def _even_directions(count: int) -> Float:
-    """(count, 3) unit vectors spread evenly over the sphere (Fibonacci spiral)."""
-    index = np.arange(count) + 0.5
-    z = 1.0 - 2.0 * index / count
-    azimuth = np.pi * (1.0 + np.sqrt(5.0)) * index
-    radius = np.sqrt(1.0 - z * z)
-    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=1)
 
 
 @njit(cache=True, nogil=True)

@@ -40,7 +40,7 @@ class ClassicalSegmenter:
         self._config = config.segmentation.classical
         self._renderer = RayRenderer(target)
         # What is lit is seldom a whole silhouette, and is compared in every frame: there the coarse bank does.
-        self._lit = LitBody(self._config, SilhouetteBank(target, self._renderer, subdivisions=2))
+        self._lit = LitBody(self._config, SilhouetteBank(target, self._renderer, n_views=162))
         self._textured = TexturedBackground(self._config, SilhouetteBank(target, self._renderer))
         self.reset()
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from hat_ros.array_types import Float, UInt8
+from hat_ros.array_types import UInt8
+from hat_ros.geometry.masks import mask_moments
 
 Mask = UInt8
 
@@ -70,18 +71,11 @@ def moved(mask: Mask, dx: int, dy: int) -> Mask:
     return out
 
 
-def centroid(mask: Mask) -> Float:
-    """Centre of gravity (x, y) in pixels of a mask that is not empty."""
-    x, y, w, h = cv2.boundingRect(mask)
-    m = cv2.moments(mask[y : y + h, x : x + w], binaryImage=True)
-    return np.array([x + m["m10"] / m["m00"], y + m["m01"] / m["m00"]])
-
-
 def shift_between(before: Mask | None, mask: Mask | None) -> tuple[int, int]:
     """Whole pixels (x, y) that a target moved; none while a mask is missing or cut by the image border."""
     if mask is None or before is None or touches_border(mask) or touches_border(before):
         return 0, 0
-    dx, dy = np.rint(centroid(mask) - centroid(before))
+    dx, dy = np.rint(mask_moments(mask).center_px - mask_moments(before).center_px)
     return int(dx), int(dy)
 
 

@@ -10,14 +10,17 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import trimesh
 
 from hat_ros.array_types import Bool, Float, Float32, UInt8
+from hat_ros.cache import cached_arrays
 from hat_ros.geometry import lie
+from hat_ros.geometry.masks import mask_moments
 from hat_ros.target.model import Target
 from hat_ros.target.rendering import Renderer
+from hat_ros.target.sphere import icosphere, look_along
 from hat_ros.types import Camera
 
+_FORMAT = 1  # raised whenever what is cached changes its meaning
 _SIDE_PX = 96  # side of the rendered silhouettes
 _RADII = 24
 _ANGLES = 64
@@ -33,26 +36,15 @@ class SilhouetteBank:
     Args:
         target: the CAD model.
         renderer: renders it.
-        subdivisions: of the icosahedron whose vertices are the view directions (3: 642 views, 2: 162, of which the
-            nearest often lies too far off a mask of thin parts).
+        n_views: size of the icosphere of view directions (with 162, the nearest often lies too far off a mask of thin
+            parts).
     """
 
-    def __init__(self, target: Target, renderer: Renderer, subdivisions: int = 3) -> None:
-        distance = _DISTANCE_RADII * target.bounding_radius_m
-        focal = 0.47 * _SIDE_PX * np.sqrt(_DISTANCE_RADII**2 - 1.0)
-        middle = (_SIDE_PX - 1) / 2
-        camera = Camera(np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]]), _SIDE_PX, _SIDE_PX)
-        polar = []
-        for direction in trimesh.creation.icosphere(subdivisions=subdivisions).vertices:
-            R = _looking_along(-np.asarray(direction))
-            T = lie.transform(R, np.array([0, 0, distance]) - R @ target.center_m)
-            mask = renderer.render(T, camera, color=False).mask
-            if mask.any():
-                center, radius = _moments(mask)
-                polar.append(_polar(mask.astype(np.uint8), center, radius))
+    def __init__(self, target: Target, renderer: Renderer, n_views: int = 642) -> None:
+        key = f"{target.sha256}:{_FORMAT}:{n_views}:{_SIDE_PX}:{_RADII}:{_ANGLES}:{_EXTENT}:{_DISTANCE_RADII}"
+        views = cached_arrays("silhouettes", key, lambda: {"views": _silhouettes(target, renderer, n_views)})["views"]
         radii = (np.arange(_RADII) + 0.5) * (_EXTENT / _RADII)
         self._weight = (radii / radii.sum() / _ANGLES).astype(np.float32)  # area of a polar cell
-        views = np.stack(polar)
         spectra = np.conj(np.fft.rfft(views, axis=-1) * self._weight[:, None]).astype(np.complex64)
         self._spectra = np.ascontiguousarray(spectra.transpose(2, 0, 1))  # frequency, view, radius
         self._areas = np.einsum("vra,r->v", views, self._weight)
@@ -62,7 +54,7 @@ class SilhouetteBank:
         if not mask.any():
             return 0.0
         image = mask.astype(np.uint8)
-        center, radius = _moments(mask)
+        center, radius = _placement(mask)
         outward = _cut_direction(mask)
         if outward is None:
             return self._overlap_at(_polar(image, center, radius), None)
@@ -88,19 +80,27 @@ class SilhouetteBank:
         return np.fft.irfft(shared.T, n=_ANGLES, axis=-1)
 
 
-def _looking_along(direction: Float) -> Float:
-    """A rotation target -> camera whose optical axis has this direction in the target frame; the roll is arbitrary."""
-    helper = np.eye(3)[np.argmin(np.abs(direction))]
-    x = np.cross(helper, direction)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(direction, x), direction])
+def _silhouettes(target: Target, renderer: Renderer, n_views: int) -> Float32:
+    """(V, radii, angles) polar silhouettes of the views that show anything."""
+    distance = _DISTANCE_RADII * target.bounding_radius_m
+    focal = 0.47 * _SIDE_PX * np.sqrt(_DISTANCE_RADII**2 - 1.0)
+    middle = (_SIDE_PX - 1) / 2
+    camera = Camera(np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]]), _SIDE_PX, _SIDE_PX)
+    forward = -icosphere(n_views)
+    down = np.eye(3)[np.argmin(np.abs(forward), axis=1)]  # the roll is arbitrary
+    polar = []
+    for R in look_along(forward, down):
+        T = lie.transform(R, np.array([0, 0, distance]) - R @ target.center_m)
+        mask = renderer.render(T, camera, color=False).mask
+        if mask.any():
+            polar.append(_polar(mask.astype(np.uint8), *_placement(mask)))
+    return np.stack(polar)
 
 
-def _moments(mask: Bool) -> tuple[Float, float]:
-    """Centroid (x, y) and radius of gyration of a mask in pixels."""
-    m = cv2.moments(mask.astype(np.uint8), binaryImage=True)
-    center = np.array([m["m10"], m["m01"]]) / m["m00"]
-    return center, max(float(np.sqrt((m["mu20"] + m["mu02"]) / m["m00"])), 0.5)
+def _placement(mask: Bool) -> tuple[Float, float]:
+    """Centroid (2,) and radius of gyration of a mask, pixels."""
+    moments = mask_moments(mask)
+    return moments.center_px, max(float(np.sqrt(moments.variance_px2)), 0.5)
 
 
 def _polar(image: UInt8, center: Float, radius: float) -> Float32:

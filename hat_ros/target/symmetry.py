@@ -17,7 +17,7 @@ from hat_ros.geometry import lie
 from hat_ros.geometry.masks import overlap
 from hat_ros.target.model import Target
 from hat_ros.target.ray_renderer import RayRenderer
-from hat_ros.target.view_bank import view_rotations
+from hat_ros.target.sphere import look_inwards
 from hat_ros.types import Camera
 
 _FORMAT = 1
@@ -49,7 +49,7 @@ def near_symmetries(target: Target) -> Float:
     position = np.array([0.0, 0.0, _DISTANCE_RADII * target.bounding_radius_m])
 
     def silhouettes(turn: Float) -> list[UInt8]:
-        poses = (lie.transform(R @ turn, position - R @ turn @ target.center_m) for R in view_rotations(_N_VIEWS))
+        poses = (lie.transform(R @ turn, position - R @ turn @ target.center_m) for R in look_inwards(_N_VIEWS))
         return [renderer.outlined(T, camera).view(np.uint8) for T in poses]
 
     as_it_is = silhouettes(np.eye(3))

@@ -16,6 +16,7 @@ from hat_ros.nets import megapose as mp
 from hat_ros.nets.runtime import Runtime
 from hat_ros.stages import create_backend
 from hat_ros.target.model import target_from_scene
+from hat_ros.target.sphere import look_inwards_upright
 from hat_ros.types import Camera, Detection, Frame
 
 CAMERA = Camera(np.array([[300.0, 0, 79.5], [0, 300.0, 59.5], [0, 0, 1]]), 160, 120)
@@ -123,7 +124,8 @@ def test_templates_see_the_whole_target_centred(target):
 
 
 def test_template_points_lie_on_the_target(target, monkeypatch):
-    monkeypatch.setattr("hat_ros.hypotheses.picopose_templates.icosphere", lambda n: np.eye(3))
+    few = look_inwards_upright(12)[:3]
+    monkeypatch.setattr("hat_ros.hypotheses.picopose_templates.look_inwards_upright", lambda n_views: few)
     templates = render_templates(target)
     points = templates.points_m[np.isfinite(templates.points_m).all(axis=-1)]
     distance = trimesh.proximity.closest_point_naive(

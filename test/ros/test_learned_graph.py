@@ -71,10 +71,11 @@ def learned(tmp_path, monkeypatch):
 
 def prepare_few_templates(config, model, monkeypatch):
     """Encode 12 templates instead of 162, in this process; the nodes find them in the cache."""
-    from hat_ros.target.sphere import icosphere
+    from hat_ros.target.sphere import look_inwards_upright
 
+    few = look_inwards_upright(12)
     with monkeypatch.context() as patch:
-        patch.setattr("hat_ros.hypotheses.picopose_templates.icosphere", lambda level: icosphere(0))
+        patch.setattr("hat_ros.hypotheses.picopose_templates.look_inwards_upright", lambda n_views: few)
         create_backend("hypotheses", config, load_target(model))
 
 

@@ -47,3 +47,20 @@ def test_what_is_not_the_model_is_less_plausible(bank, scene):
 
 def test_nothing_is_not_plausible(bank):
     assert bank.overlap(np.zeros((50, 60), bool)) == 0.0
+
+
+def test_silhouettes_are_rendered_once_per_model(lopsided, monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    n_rendered = 0
+
+    class Counted(RayRenderer):
+        def render(self, *args, **kwargs):
+            nonlocal n_rendered
+            n_rendered += 1
+            return super().render(*args, **kwargs)
+
+    banks = [SilhouetteBank(lopsided, Counted(lopsided), n_views=162) for _ in range(2)]
+    assert n_rendered == 162
+    mask = np.zeros((100, 140), np.bool_)
+    mask[20:70, 30:60] = True
+    assert banks[0].overlap(mask) == banks[1].overlap(mask)

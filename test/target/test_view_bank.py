@@ -5,6 +5,7 @@ from shape_scene import spacecraft
 
 from hat_ros.cache import cache_folder
 from hat_ros.geometry import lie
+from hat_ros.geometry.masks import mask_moments
 from hat_ros.target import view_bank
 from hat_ros.target.model import target_from_scene
 from hat_ros.target.ray_renderer import RayRenderer
@@ -18,17 +19,6 @@ def target():
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-
-
-@pytest.mark.parametrize("n_views", [162, 642, 2562])
-def test_views_cover_the_sphere_evenly(n_views):
-    R = view_bank.view_rotations(n_views)
-    assert R.shape == (n_views, 3, 3)
-    assert lie.is_rigid(lie.transform(R, np.zeros((n_views, 3)))).all()
-    directions = -R[:, 2]
-    cosines = directions @ directions.T - 2 * np.eye(n_views)
-    nearest_deg = np.degrees(np.arccos(np.clip(cosines.max(axis=1), -1, 1)))
-    assert nearest_deg.max() < 1.4 * nearest_deg.min()
 
 
 def test_a_damaged_cache_is_built_again(target):
@@ -59,32 +49,6 @@ def test_contour_points_lie_on_the_target(target):
     assert used.sum(axis=1).min() > 20
 
 
-def test_moments_of_a_disc():
-    y, x = np.mgrid[:100, :120]
-    center, gyration = view_bank.mask_moments((x - 60) ** 2 + (y - 45) ** 2 <= 30**2)
-    np.testing.assert_allclose(center, [60, 45], atol=1e-6)
-    assert gyration == pytest.approx(30 / np.sqrt(2), rel=0.01)
-
-
-@pytest.mark.parametrize("gyration_px", [8.0, 30.0, 55.0])
-def test_a_sampler_of_many_grids_gives_what_the_whole_image_gives(gyration_px):
-    image = np.zeros((120, 160), np.float32)
-    image[:50, 60:120] = 0.5
-    image[20:70, 90:160] = 1.0
-    sampler = view_bank.PolarSampler(image)
-    for center in ((100.0, 40.0), (70.3, 12.8), (159.0, 60.0)):
-        grid = sampler.grid(np.array(center), gyration_px, 24)
-        whole = image + np.float32(1e-30)  # nothing is black: nothing is left out
-        np.testing.assert_allclose(grid, view_bank.polar_grid(whole, np.array(center), gyration_px, 24), atol=1e-6)
-
-
-def test_the_border_grid_is_that_of_ones():
-    ones = np.ones((120, 160), np.float32)
-    for center in ((80.0, 60.0), (3.0, 100.0)):
-        inside = view_bank.border_grid(ones.shape, np.array(center), 30.0, 24)
-        np.testing.assert_allclose(inside, view_bank.polar_grid(ones, np.array(center), 30.0, 24), atol=0.06)
-
-
 def _body_and_boom(scale, boom_px):
     """A body of 60 x 40 pixels, and a boom of some width three times as far out; both magnified."""
     mask = np.zeros((120 * scale, 200 * scale), np.bool_)
@@ -112,10 +76,10 @@ def test_what_is_as_wide_as_a_panel_is_kept_and_so_is_a_body_that_is_thin_all_ov
 
 def test_a_mask_without_the_boom_has_the_moments_of_the_view_with_it():
     mask, with_boom = _body_and_boom(1, boom_px=2)
-    seen, shown = (view_bank.mask_moments(view_bank.without_thin_parts(m)) for m in (mask, with_boom))
-    np.testing.assert_allclose(shown[0], seen[0], atol=0.5)
-    assert shown[1] == pytest.approx(seen[1], rel=0.02)
-    assert view_bank.mask_moments(with_boom)[1] > 1.2 * seen[1]  # so much the boom would have changed it
+    seen, shown = (mask_moments(view_bank.without_thin_parts(m)) for m in (mask, with_boom))
+    np.testing.assert_allclose(shown.center_px, seen.center_px, atol=0.5)
+    assert shown.gyration_px == pytest.approx(seen.gyration_px, rel=0.02)
+    assert mask_moments(with_boom).gyration_px > 1.2 * seen.gyration_px  # so much the boom would have changed it
 
 
 def test_a_bank_without_thin_parts_describes_the_body_that_carries_them():
