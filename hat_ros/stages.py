@@ -1,19 +1,20 @@
 """The seams of the method: what a backend must offer, and the name -> backend map.
 
-A backend is a class in a file of its own. It is imported only when its name is asked for, so that nobody pays for
-torch to run the default preset. To add one: write the class, add one line to :data:`BACKENDS`.
+A backend is a class in a file of its own. It is imported only when its name is asked for, so that the
+default preset runs without torch. To add one: write the class, add one line to :data:`BACKENDS`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from importlib import import_module
-from typing import Protocol
+from typing import Literal, Protocol, overload
 
+from hat_ros.array_types import Float
 from hat_ros.config import HatConfig
 from hat_ros.errors import ConfigError, MissingDependencyError
 from hat_ros.target.model import Target
-from hat_ros.types import Candidates, Detection, Frame, Motion, PosePrior
+from hat_ros.types import Candidates, Detection, Frame, Motion, PosePrior, Refined, RotationPrior
 
 
 class Segmenter(Protocol):
@@ -52,6 +53,31 @@ class MotionEstimator(Protocol):
         ...
 
 
+class PoseRefiner(Protocol):
+    """Measures a pose on one image by moving it to the nearest optimum; used by Stage 4."""
+
+    def refine(
+        self, frame: Frame, detection: Detection | None, T_cam_target: Float, prior: RotationPrior | None = None
+    ) -> Refined | None:
+        """Refine a (4, 4) pose.
+
+        Args:
+            frame: the image.
+            detection: its mask, None if the target was not found.
+            T_cam_target: (4, 4) where to start.
+            prior: what is known of the rotation; it counts as much as it is certain.
+
+        Returns:
+            The pose with the covariance of the image alone; None when the image supports no pose near the start, or
+            one outside its basin only.
+        """
+        ...
+
+    def reset(self) -> None:
+        """Forget everything learned from earlier frames."""
+        ...
+
+
 BACKENDS: dict[str, dict[str, str]] = {
     "segmentation": {
         "classical": "hat_ros.segmentation.classical:ClassicalSegmenter",
@@ -70,14 +96,14 @@ BACKENDS: dict[str, dict[str, str]] = {
     },
 }
 
-# slam backend -> motion of a whole clip in hindsight, for the offline reference; others keep what they said.
+# slam backend -> its motion smoothed over the whole clip, for the non-causal reference; others have causal motion only.
 OFFLINE_MOTIONS: dict[str, str] = {"droid": "hat_ros.motion.droid:offline_motions"}
 
 OfflineMotions = Callable[[HatConfig, Sequence[tuple[Frame, Detection | None]]], list[Motion]]
 
 
 def offline_motions_of(config: HatConfig) -> OfflineMotions | None:
-    """What the motion backend makes of a whole clip; None if it has nothing to add to its causal answers."""
+    """The motion backend's smoothing over a whole clip; None if it has only its causal motion."""
     where = OFFLINE_MOTIONS.get(config.slam.backend)
     if where is None:
         return None
@@ -85,6 +111,12 @@ def offline_motions_of(config: HatConfig) -> OfflineMotions | None:
     return getattr(import_module(module_name), function_name)
 
 
+@overload
+def create_backend(stage: Literal["segmentation"], config: HatConfig, target: Target) -> Segmenter: ...
+@overload
+def create_backend(stage: Literal["hypotheses"], config: HatConfig, target: Target) -> HypothesisBackend: ...
+@overload
+def create_backend(stage: Literal["slam"], config: HatConfig, target: Target) -> MotionEstimator: ...
 def create_backend(stage: str, config: HatConfig, target: Target) -> Segmenter | HypothesisBackend | MotionEstimator:
     """Build the backend that ``config.<stage>.backend`` names.
 

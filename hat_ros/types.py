@@ -1,7 +1,7 @@
 """What flows between the stages: frame -> detection -> candidates -> motion -> selection -> estimate.
 
-Every type holds exactly what its topic carries (DESIGN section 4), in the same float64 bits, so a stage cannot tell
-whether its input came through memory or through DDS. Poses are kept as rows ``[x y z qx qy qz qw]`` (metres, unit
+Every type holds exactly what its topic carries (see ``docs/topics.md``), in the same float64 bits, so a stage cannot
+tell whether its input came through memory or through DDS. Poses are kept as rows ``[x y z qx qy qz qw]`` (metres, unit
 quaternion); ``T_cam_target`` and friends are derived. All types are frozen; arrays in them are never written to.
 """
 
@@ -133,7 +133,7 @@ class Detection:
 
 @dataclass(frozen=True)
 class PosePrior:
-    """What the fused poses of the past say about this frame (DESIGN 5.4); built by ``core.prior``.
+    """What the fused poses of the past say about this frame; built by :class:`~hat_ros.tracking.prior.PriorBuffer`.
 
     Attributes:
         stamp_ns: stamp of the newest fused pose used, at least ``delay_frames`` frames before this one.
@@ -378,6 +378,12 @@ class Alignment:
     def R_target_slam(self) -> Float:
         """(3, 3) rotation."""
         return lie.matrix_from_quat(self.quat_xyzw)
+
+    def target_in_camera(self, T_slam_cam: Float) -> Float:
+        """(4, 4) metric ``T_cam_target`` of a (4, 4) SLAM pose: S(A) of eq. (alignmentmap)."""
+        R_target_cam = self.R_target_slam @ T_slam_cam[:3, :3]
+        centre_m = self.scale * (self.R_target_slam @ T_slam_cam[:3, 3]) + self.translation_m
+        return lie.transform(R_target_cam.T, -R_target_cam.T @ centre_m)
 
 
 @dataclass(frozen=True)

@@ -82,13 +82,6 @@ class SlamAlignment:
         self._n_fits += 1
         self.current = self._robust_fit(*start, rounds, epoch)
 
-    def aligned(self, T_slam_cam: Float) -> Float:
-        """(4, 4) target-in-camera pose S(A) of a SLAM pose, eq. (alignmentmap); there must be a similarity."""
-        fit = self.current
-        R_target_cam = fit.R_target_slam @ T_slam_cam[:3, :3]
-        centre_m = fit.scale * (fit.R_target_slam @ T_slam_cam[:3, 3]) + fit.translation_m
-        return lie.transform(R_target_cam.T, -R_target_cam.T @ centre_m)
-
     def _robust_fit(self, scale: float, quat_xyzw: Float, rounds: int, epoch: int) -> Alignment:
         """Fit to all observations, then again to those with small residuals, up to ``rounds`` times."""
         history, lever = self._history, self._config.lever_m_per_rad

@@ -61,7 +61,7 @@ def guard_candidates(candidates: Candidates, drop: bool) -> Candidates:
 
 
 def _rigid_rows(pose_rows: Float) -> Bool:
-    finite = np.isfinite(pose_rows).all(axis=1)
+    finite: Bool = np.all(np.isfinite(pose_rows), axis=1)
     norm = np.linalg.norm(np.where(finite[:, None], pose_rows[:, 3:], 0.0), axis=1)
     return finite & (np.abs(norm - 1.0) < _QUAT_NORM_TOLERANCE)
 

@@ -32,15 +32,18 @@ class InertialPrior:
         self._share = inertial_weight**2 / total if relative_weight > 0.0 else 0.0
         self._last: tuple[Float, Float] | None = None
 
-    def smooth(self, output: Float | None, predicted: Float | None) -> Float | None:
-        """The prediction drawn towards the last increment: (4, 4), or None without a prediction.
+    def forget(self) -> None:
+        """A frame has no prediction: the increments before it are void."""
+        self._last = None
+
+    def smooth(self, output: Float, predicted: Float) -> Float:
+        """The prediction drawn towards the last increment: (4, 4).
 
         Args:
             output: (4, 4) previous output.
-            predicted: (4, 4) relative motion applied to it; None when there is none, and then the past is forgotten.
+            predicted: (4, 4) relative motion applied to it.
         """
-        if self._share == 0.0 or predicted is None:
-            self._last = None
+        if self._share == 0.0:
             return predicted
         R, t = predicted[:3, :3], predicted[:3, 3]
         if self._last is not None:

@@ -15,7 +15,7 @@ class KeyframeSchedule:
     opportunity stays open for the next frame that has one.
 
     Our extension: while a track is settled, an absolute estimate has little to add, and the gap is
-    ``settled_factor`` times as long; and an attempt in vain is repeated as many times sooner, since a wrong start
+    ``settled_factor`` times as long; and a failed attempt is repeated as many times sooner, since a wrong start
     stands until then: a first one that decided nothing, or any on a detection that soon turned out to be of something
     else. Frames that were left out count as well. The paper's spacing is a factor of 1.
     """
@@ -27,13 +27,20 @@ class KeyframeSchedule:
         self._settled_gap_frames = config.gap_frames * config.settled_factor
         self.reset()
 
-    def update(self, has_detection: bool, healthy: bool = False, in_vain: bool = False, n_missed: int = 0) -> bool:
+    def reset(self) -> None:
+        """The next frame with a detection is an opportunity."""
+        self._frames_since_attempt = self._gap_frames
+        self._n_attempts = 0
+        self._decided = True
+        self._healthy_attempts = 0
+
+    def update(self, has_detection: bool, healthy: bool = False, failed: bool = False, n_missed: int = 0) -> bool:
         """Count one input frame; True when candidates are to be generated for it.
 
         Args:
             has_detection: the target has been found in the image.
             healthy: the fused state of the past, as the prior of this frame tells it, is TRACKING.
-            in_vain: what the last attempt was made on turned out to be a part of the target, or something else.
+            failed: what the last attempt was made on turned out to be a part of the target, or something else.
             n_missed: frames left out right before this one; after a whole gap of them no track is settled.
         """
         n_missed = n_missed if self._counts_missed else 0
@@ -42,7 +49,7 @@ class KeyframeSchedule:
             self._healthy_attempts = 0
         settled = self._healthy_attempts >= SETTLING_ATTEMPTS
         gap_frames = self._settled_gap_frames if settled else self._gap_frames
-        if in_vain or (self._n_attempts == 1 and not self._decided):
+        if failed or (self._n_attempts == 1 and not self._decided):
             gap_frames = self._early_gap_frames
         if not has_detection or self._frames_since_attempt < gap_frames:
             return False
@@ -54,10 +61,3 @@ class KeyframeSchedule:
     def answered(self, decided: bool) -> None:
         """What came of the last attempt: whether one basin clearly leads."""
         self._decided = decided
-
-    def reset(self) -> None:
-        """The next frame with a detection is an opportunity."""
-        self._frames_since_attempt = self._gap_frames
-        self._n_attempts = 0
-        self._decided = True
-        self._healthy_attempts = 0

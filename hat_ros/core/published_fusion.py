@@ -29,7 +29,7 @@ class Fused:
         predicted: (4, 4) relative motion applied to the previous output, None without one.
         gate_weight: g at an anchor, NaN elsewhere.
         reset: the alignment was dropped at this frame.
-        measurement: (4, 4) what this frame's own image says, None when it says nothing.
+        measurement: (4, 4) what this frame's own image measures, None when there is no measurement.
         covariance: (6, 6) of the measurement, None when its source does not know.
         certain: the output is to be called TRACKING.
     """
@@ -94,9 +94,9 @@ class PublishedFusion:
         self.alignment.update(motion.epoch)
 
         gate_weight, reset = (float("nan") if anchor is None else 1.0), False
-        if anchor is not None and motion.valid and self.alignment.current is not None:
-            aligned = self.alignment.aligned(motion.T_slam_cam)
-            if self._dissent.update(anchor, aligned):
+        current = self.alignment.current
+        if anchor is not None and motion.valid and current is not None:
+            if self._dissent.update(anchor, current.target_in_camera(motion.T_slam_cam)):
                 gate_weight = self._config.gate_weight
             if self._dissent.is_conclusive:
                 gate_weight, reset = 1.0, True
@@ -119,24 +119,27 @@ class PublishedFusion:
         self._dissent.clear()
 
     def _fuse(self, motion: Motion, anchor: Float | None, gate_weight: float, confidence: float) -> Fused:
-        alignment, config = self.alignment, self._config
-        if alignment.current is None or alignment.n_observations < config.warmup_observations:
+        current, config = self.alignment.current, self._config
+        if current is None or self.alignment.n_observations < config.warmup_observations:
             return Fused(anchor)
-        predicted = self._predict(motion)
+        predicted = self._predict(motion, current.scale)
         if predicted is None:
             # Without a relative residual the minimum is the anchor itself; without either, the aligned SLAM pose.
-            alone = alignment.aligned(motion.T_slam_cam) if anchor is None and motion.valid else anchor
+            alone = current.target_in_camera(motion.T_slam_cam) if anchor is None and motion.valid else anchor
             return Fused(alone)
         if anchor is None:
             return Fused(predicted, predicted)
         fused = fuse_two(anchor, gate_weight * confidence, predicted, config, self._lever_m_per_rad)
         return Fused(fused, predicted)
 
-    def _predict(self, motion: Motion) -> Float | None:
+    def _predict(self, motion: Motion, scale: float) -> Float | None:
         """Delta S applied to the previous frame's output; None unless that and both SLAM poses exist."""
         output, previous = self._previous
-        step = None if output is None else relative_motion(previous, motion, self.alignment.current.scale)
-        return self._inertia.smooth(output, None if step is None else step @ output)
+        step = relative_motion(previous, motion, scale)
+        if output is None or step is None:
+            self._inertia.forget()
+            return None
+        return self._inertia.smooth(output, step @ output)
 
 
 class Dissent:

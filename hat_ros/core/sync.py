@@ -1,4 +1,4 @@
-"""The rules by which frames enter the graph and messages meet again (DESIGN 5.1, 5.2), without any middleware.
+"""The rules by which frames enter the graph and messages meet again, without any middleware.
 
 Streams are FIFO each; between streams any delay is possible. Nothing here looks at a clock or at arrival order, so the
 graph computes what one process would.

@@ -45,9 +45,9 @@ class HypothesisStage:
         """
         healthy = prior is not None and prior.healthy
         self._observe(detection)
-        in_vain = self._changed and (prior is None or not prior.supported)
+        failed = self._changed and (prior is None or not prior.supported)
         n_missed = self._cadence.missed(frame.stamp_ns)
-        if not self._schedule.update(detection is not None, healthy, in_vain, n_missed) or detection is None:
+        if not self._schedule.update(detection is not None, healthy, failed, n_missed) or detection is None:
             return Candidates.none()
         self._changed = False
         candidates = self._backend.generate(frame, detection, prior)

@@ -1,4 +1,4 @@
-"""Which basin the hypotheses of the last keyframes vouch for, against the one that the output stands in."""
+"""How certain the output's basin is: what the hypotheses of the last keyframes say of it and of competing basins."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class BasinConfidence:
     """Compares the output with the decoder and with appearance alone.
 
     The decoder weighs all keyframes so far, and one clear mistake carries it for a while; the best appearance of a
-    keyframe owes nothing to earlier ones. Where the two differ, nobody knows.
+    keyframe is independent of earlier ones. Where the two differ, the basin is ambiguous.
 
     Args:
         config: the ``refinement`` section.
@@ -35,7 +35,7 @@ class BasinConfidence:
         self._appearance: deque[float] = deque(maxlen=_KEYFRAMES)
 
     def update(self, selection: Selection, T_cam_target: Float | None) -> None:
-        """Look at one frame: its candidates, if it is a keyframe, and its output (4, 4), None if there is none."""
+        """Take in one frame: its candidates, if it is a keyframe, and its output (4, 4), None if there is none."""
         if T_cam_target is None or selection.selected < 0:
             return
         R = T_cam_target[:3, :3]
@@ -46,9 +46,9 @@ class BasinConfidence:
         """Whether a keyframe's decoder clearly prefers the basin of a pose (4, 4)."""
         return selection.margin(T_cam_target[:3, :3], self._apart_deg) >= self._config.min_margin
 
-    def vouches(self, confirmed: bool) -> bool:
-        """Whether the output's basin is beyond doubt; ``confirmed`` by the image or a second anchor, or not."""
+    def is_certain(self, confirmed: bool) -> bool:
+        """Whether the output's basin is certain; ``confirmed`` by the image or a second anchor, or not."""
         if self.margin < self._config.min_margin or min(self._appearance, default=0.0) < 0.0:
             return False
-        # A lead over nobody says nothing.
+        # Without a competing basin the margin is infinite and means nothing.
         return confirmed or self._config.sure_margin <= self.margin < np.inf

@@ -1,29 +1,30 @@
-"""Stage 4 with an eye on the image: every output is refined where it is, causally. Our extension of the paper.
+"""Stage 4 with image measurements: every output is refined on its own image, causally. Our extension of the paper.
 
 The paper refines offline and lets SLAM and anchors alone carry the causal pose. Here each frame's prediction (relative
 motion applied to the previous output) is refined on that frame's own image, and an accepted refinement is a measurement
 like an anchor: it becomes the output, and with it the previous output of the next frame. What the image does not show
-of the rotation stays as predicted, as far as the predictions of late deserve it (``core.attitude``).
+of the rotation stays as predicted, as far as the recent predictions deserve it (:mod:`hat_ros.tracking.attitude`).
 
 At keyframes the selected anchor competes with the track:
 
 * Within D of the track it is one basin, and the anchor one more start for the refinement: the best result wins.
-* Beyond D it is a rival. Successive rivals that follow from each other (the paper's coherence) add up, and so does
-  their lead in image evidence over the track. A rival takes over once it is supported, leads by ``arbitration_margin``
-  and is the decoder's clear choice, if anchors stood for the track; or once more coherent rivals stand against the
-  track than anchors clearly stood for it, the first one included (``reset_anchors`` at most, as in the paper), unless
-  the image speaks against them by that margin.
+* Beyond D it stands in a competing basin. Successive anchors in it that follow from each other (the paper's
+  coherence) add up, and so does their lead in image evidence over the track. The competing basin takes over once it is
+  supported, leads by ``arbitration_margin`` and, if anchors support the track, is the decoder's clear choice; or once
+  more coherent anchors support it than clear ones support the track, the first one included (``reset_anchors`` at most,
+  as in the paper), unless the image evidence is against it by that margin. This is the hysteresis of the track.
 
 With no refinement supported, the output is what the paper's fusion makes of prediction and anchor, and it coasts. A
-supported output is called TRACKING only if it is beyond doubt as well (``core.confidence``): the image is certain, or a
-second anchor came out close to where the track expected it, or the decoder's lead is large; some image so far was
-explained well, or three anchors came out close; and no two anchors in a row have disagreed since.
+supported output is called TRACKING only if its basin is certain as well (:mod:`hat_ros.tracking.confidence`): the
+image is certain, or a second anchor confirmed the track's prediction, or the decoder's lead is large; some image so far
+was explained well, or three anchors confirmed the prediction; and no two anchors in a row have disagreed since.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import TypeGuard
 
 import numpy as np
 
@@ -34,22 +35,46 @@ from hat_ros.core.cadence import Cadence
 from hat_ros.core.published_fusion import AreaConfidence, Dissent, Fused, fuse_two, relative_motion
 from hat_ros.core.selector import box_area_px
 from hat_ros.geometry import lie
+from hat_ros.stages import PoseRefiner
 from hat_ros.tracking.attitude import AttitudeFilter
 from hat_ros.tracking.confidence import BasinConfidence
 from hat_ros.tracking.prior import extrapolate
-from hat_ros.tracking.refiner import Refiner
 from hat_ros.tracking.uncertainty import KeyframeSpread, widened
 from hat_ros.types import Detection, Frame, Motion, Refined, RotationPrior, Selection
 
-# An anchor further from where the track expected it than this share of D shares its basin, but bears no witness to it.
+# An anchor within this share of D confirms the prediction; further off it shares the basin, and confirms nothing.
 _CLOSE_SHARE = 0.5
-# A wrong pose hardly ever explains an image well, and its lead among other poor ones says little: a track with evidence
-# that never came this far needs so many agreeing anchors, since masks err alike at successive keyframes.
-_EXPLAINED_QUALITY, _WITNESSES = 0.83, 3
-# So many frames left out in a row carry a target out of its basin: what vouched for the track before is void.
+# A wrong pose hardly ever explains an image well, and its lead among other poor ones means little: a track whose
+# evidence never came this far needs so many confirmations, since masks err alike at successive keyframes.
+_EXPLAINED_QUALITY, _CONFIRMATIONS = 0.83, 3
+# So many frames left out in a row carry a target out of its basin: what supported the track before is void.
 _INTERRUPTION_FRAMES = 5
 # Measured outputs behind the constant-rate prediction.
 _RATE_HISTORY = 6
+
+
+@dataclass
+class _TrackSupport:
+    """What supports the basin of the present track.
+
+    Attributes:
+        best_quality: of its refinements so far.
+        confirmed: the image is certain of the basin, or an anchor has confirmed a prediction.
+        clear_start: it started from an anchor that was the decoder's clear choice.
+        n_confirmations: clear anchors close to their prediction since; one that is not close starts the count anew.
+        n_disagreements: anchors outside the basin since the last one inside.
+    """
+
+    best_quality: float = 0.0
+    confirmed: bool = False
+    clear_start: bool = False
+    n_confirmations: int = 0
+    n_disagreements: int = 0
+
+    @property
+    def n_anchors(self) -> int:
+        """Clear anchors behind the track; none counts while no image has supported it."""
+        return self.n_confirmations + self.clear_start if self.best_quality > 0.0 else 0
 
 
 class ImageFusion:
@@ -59,7 +84,7 @@ class ImageFusion:
         alignment: the Sim(3), fitted to measured outputs at keyframes.
     """
 
-    def __init__(self, config: HatConfig, refiner: Refiner) -> None:
+    def __init__(self, config: HatConfig, refiner: PoseRefiner) -> None:
         self._fusion, self._refinement = config.fusion, config.refinement
         self._alignment_config = config.alignment
         self._refiner = refiner
@@ -87,26 +112,22 @@ class ImageFusion:
         self._just_measured = False
 
     def _start_track(self) -> None:
-        """Nobody has spoken for or against the track yet, and nothing is known of its predictions."""
+        """Nothing supports or contradicts the track yet, and nothing is known of its predictions."""
         self._attitude.forget()
         self._held: Refined | None = None
-        self._best_quality = 0.0
-        self._confirmed = False  # the image is certain of the basin, or an anchor has agreed with it
-        self._founded = False  # by an anchor that was the decoder's clear choice
-        self._n_agreed = 0  # such anchors since
-        self._n_disagreed = 0
-        self._forget_rivals()
+        self._support = _TrackSupport()
+        self._forget_competitors()
 
     def update(self, frame: Frame, detection: Detection | None, motion: Motion, selection: Selection) -> Fused:
         """Advance by one frame. See :class:`~hat_ros.core.fusion.FusionMethod`."""
         anchor, confidence, decided = selection.anchor, 1.0, False
         if anchor is not None:
             confidence = self._area_confidence.update(box_area_px(selection.candidates.box_xyxy))
-            # An anchor that barely won speaks for no track, nor does it alone overthrow one.
+            # An anchor with a small margin supports no track, nor does it alone replace one.
             decided = self._confidence.decides(selection, anchor)
         fused = self._advance(frame, detection, motion, anchor, confidence, decided)
         self._confidence.update(selection, fused.T_cam_target)
-        return replace(fused, certain=fused.certain and self._confidence.vouches(self._confirmed))
+        return replace(fused, certain=fused.certain and self._confidence.is_certain(self._support.confirmed))
 
     def spread(self, selection: Selection, T_cam_target: Float) -> Float:
         """(6, 6) spread of the hypotheses about the output over the last keyframes (:class:`KeyframeSpread`)."""
@@ -126,12 +147,15 @@ class ImageFusion:
             self.alignment.reset()
         if self._cadence.missed(frame.stamp_ns) >= _INTERRUPTION_FRAMES:
             self._start_track()
-        predictions = self._predictions(frame.stamp_ns, motion)
-        fused = self._decide(frame, detection, predictions, anchor, confidence, decided)
+        if self._output is None:
+            fused = self._start(frame, detection, anchor, decided)
+        else:
+            predictions = self._predictions(frame.stamp_ns, motion, *self._output)
+            fused = self._decide(frame, detection, predictions, anchor, confidence, decided)
         if fused.reset:
             self.alignment.reset()
         if fused.measurement is not None:
-            if self._jumps(fused):
+            if self._jumps(fused.measurement, fused.predicted):
                 self._measured.clear()
             self._measured.append((frame.stamp_ns, fused.measurement))
             if anchor is not None and motion.valid:
@@ -150,33 +174,26 @@ class ImageFusion:
         confidence: float,
         decided: bool,
     ) -> Fused:
-        if not predictions:
-            return self._start(frame, detection, anchor, decided)
         predicted = predictions[0]
-        self._held = self._refiner.refine(frame, detection, predicted, self._known_of(predicted))
+        self._held = self._refiner.refine(frame, detection, predicted, self._rotation_prior(predicted))
         track = self._best_refined(frame, detection, predictions[1:], self._held, self._refinement.switch_margin)
         if anchor is None:
             return self._outcome(track, predicted, predicted)
         reference = track.T_cam_target if is_supported(track, self._refinement) else predicted
         if not self._dissent.update(anchor, reference):
-            self._forget_rivals()
+            self._forget_competitors()
             apart_rad = lie.angle_between(anchor[:3, :3], predicted[:3, :3])
             close = apart_rad <= np.radians(_CLOSE_SHARE * self._fusion.gate_angle_deg)
-            self._n_agreed = self._n_agreed + decided if close else 0
-            self._n_disagreed = 0
+            self._support.n_confirmations = self._support.n_confirmations + decided if close else 0
+            self._support.n_disagreements = 0
             return self._agree(frame, detection, track, predicted, anchor, confidence)
         return self._arbitrate(frame, detection, track, predicted, anchor, decided)
-
-    def _known_of(self, predicted: Float) -> RotationPrior:
-        """What the track says of its rotation now."""
-        output, _ = self._output
-        return RotationPrior(predicted[:3, :3], self._attitude.predict(predicted[:3, :3] @ output[:3, :3].T))
 
     def _start(self, frame: Frame, detection: Detection | None, anchor: Float | None, decided: bool) -> Fused:
         """Without a track the anchor starts one; unless the image supports it, it only coasts."""
         if anchor is None:
             return Fused(None)
-        self._founded = decided
+        self._support.clear_start = decided
         refined = self._best_refined(frame, detection, [anchor])
         return replace(self._outcome(refined, anchor, None), gate_weight=1.0)
 
@@ -210,38 +227,42 @@ class ImageFusion:
     ) -> Fused:
         """Anchor and track stand in different basins: weigh the evidence so far.
 
-        Against a track that others have spoken for, one anchor that barely won is not enough, however much the mask,
-        which both were compared with, prefers it. Anchors that agree on what no image has ever supported say nothing.
+        Against a track that other anchors support, one with a small margin is not enough, however much the mask,
+        which both were compared with, prefers it. Anchors that agree on what no image has ever supported do not count.
         """
-        self._n_disagreed += 1
-        rival = self._best_refined(frame, detection, [anchor])
-        lead = quality(rival) - quality(track)
+        self._support.n_disagreements += 1
+        competitor = self._best_refined(frame, detection, [anchor])
+        lead = quality(competitor) - quality(track)
         self._lead = lead if self._dissent.count == 1 else self._lead + lead
-        n_spoken = self._n_agreed + self._founded if self._best_quality > 0.0 else 0
-        needed = min(n_spoken + 1, self._alignment_config.reset_anchors)
+        n_anchors = self._support.n_anchors
+        needed = min(n_anchors + 1, self._alignment_config.reset_anchors)
         margin = self._refinement.arbitration_margin
-        clearly_better = self._lead >= margin and is_supported(rival, self._refinement)
-        clearly_better &= decided or n_spoken == 0
+        clearly_better = self._lead >= margin and is_supported(competitor, self._refinement)
+        clearly_better &= decided or n_anchors == 0
         outnumbers = self._dissent.count >= needed and self._lead > -margin
         if not (clearly_better or outnumbers):
             return replace(self._outcome(track, predicted, predicted), gate_weight=self._fusion.gate_weight)
         self._start_track()
-        self._founded = decided
-        return replace(self._outcome(rival, anchor, None), gate_weight=1.0, reset=True)
+        self._support.clear_start = decided
+        return replace(self._outcome(competitor, anchor, None), gate_weight=1.0, reset=True)
 
-    def _forget_rivals(self) -> None:
+    def _forget_competitors(self) -> None:
         self._dissent.clear()
         self._lead = 0.0
 
-    def _predictions(self, stamp_ns: int, motion: Motion) -> list[Float]:
-        """Where the track should be now, best first; empty without a track.
+    def _rotation_prior(self, predicted: Float) -> RotationPrior | None:
+        """What the track says of its rotation now; None without a track."""
+        if self._output is None:
+            return None
+        output, _ = self._output
+        return RotationPrior(predicted[:3, :3], self._attitude.predict(predicted[:3, :3] @ output[:3, :3].T))
+
+    def _predictions(self, stamp_ns: int, motion: Motion, output: Float, previous: Motion) -> list[Float]:
+        """Where the track should be now, best first, from its last output (4, 4) and the motion there.
 
         How the target turns relative motion knows from its second frame, how far it moves in metres only once it is
         aligned; until then the constant rate says it.
         """
-        if self._output is None:
-            return []
-        output, previous = self._output
         at_rate = self._at_constant_rate(stamp_ns)
         scale = 0.0 if self.alignment.current is None else self.alignment.current.scale
         step = relative_motion(previous, motion, scale)
@@ -253,8 +274,9 @@ class ImageFusion:
             position = (output if at_rate is None else at_rate)[:3, 3]
         moved = lie.transform(step[:3, :3] @ output[:3, :3], position)
         # A rate that no image has confirmed of late is no second opinion.
-        second = at_rate is not None and self._just_measured and not self._same(moved, at_rate)
-        return [moved, at_rate] if second else [moved]
+        if at_rate is None or not self._just_measured or self._same(moved, at_rate):
+            return [moved]
+        return [moved, at_rate]
 
     def _at_constant_rate(self, stamp_ns: int) -> Float | None:
         """The measured outputs continued; None with fewer than two."""
@@ -288,11 +310,11 @@ class ImageFusion:
         apart_rad = lie.angle_between(T_a[:3, :3], T_b[:3, :3])
         return bool(apart_rad <= np.radians(self._refinement.same_pose_deg))
 
-    def _jumps(self, fused: Fused) -> bool:
+    def _jumps(self, measurement: Float, predicted: Float | None) -> bool:
         """The measurement left the pose that the past predicted: earlier poses tell no rate."""
-        if fused.predicted is None:
+        if predicted is None:
             return True
-        apart_rad = lie.angle_between(fused.measurement[:3, :3], fused.predicted[:3, :3])
+        apart_rad = lie.angle_between(measurement[:3, :3], predicted[:3, :3])
         return bool(apart_rad > np.radians(2.0 * self._refinement.same_pose_deg))
 
     def _outcome(self, refined: Refined | None, otherwise: Float, predicted: Float | None) -> Fused:
@@ -300,21 +322,22 @@ class ImageFusion:
         if not is_supported(refined, self._refinement):
             return Fused(otherwise, predicted)
         T = refined.T_cam_target
-        if refined is self._held:
+        if refined is self._held and predicted is not None:
             self._attitude.correct(T[:3, :3], predicted[:3, :3], refined.covariance[3:, 3:])
         else:
             self._attitude.restart(T[:3, :3], refined.covariance[3:, 3:])
-        self._best_quality = max(self._best_quality, quality(refined))
-        explained = self._best_quality >= _EXPLAINED_QUALITY
+        support = self._support
+        support.best_quality = max(support.best_quality, quality(refined))
+        explained = support.best_quality >= _EXPLAINED_QUALITY
         # An unknown overlap (NaN) is never certain.
         sure = min(refined.overlap, refined.support) >= self._refinement.certain_share
-        self._confirmed = sure or self._n_agreed > 0
+        support.confirmed = sure or support.n_confirmations > 0
         return Fused(
             T,
             predicted,
             measurement=T,
             covariance=widened(refined.covariance, refined.misfit_px, self._basin(T)),
-            certain=self._n_disagreed <= 1 and (explained or self._n_agreed >= _WITNESSES),
+            certain=support.n_disagreements <= 1 and (explained or support.n_confirmations >= _CONFIRMATIONS),
         )
 
     def _basin(self, T_cam_target: Float) -> Float:
@@ -323,8 +346,8 @@ class ImageFusion:
         return np.repeat([shift_m, np.radians(self._fusion.gate_angle_deg)], 3)
 
 
-def is_supported(refined: Refined | None, config: RefinementConfig) -> bool:
-    """Whether the image speaks for a refined pose; without a silhouette mask the contour speaks alone."""
+def is_supported(refined: Refined | None, config: RefinementConfig) -> TypeGuard[Refined]:
+    """Whether the image supports a refined pose; without a silhouette mask the contour decides alone."""
     if refined is None:
         return False
     overlaps = np.isnan(refined.overlap) or refined.overlap >= config.min_overlap

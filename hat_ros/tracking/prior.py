@@ -11,7 +11,7 @@ from functools import cache
 
 import numpy as np
 
-from hat_ros.array_types import Float
+from hat_ros.array_types import Float, Int
 from hat_ros.config import PriorConfig
 from hat_ros.geometry import lie
 from hat_ros.types import Estimate, PosePrior, TrackState
@@ -86,13 +86,16 @@ class PriorBuffer:
         return {stamp: self._frames[stamp] for stamp in stamps[max(end - HISTORY_FRAMES, 0) : max(end, 0)]}
 
 
-def _unbroken_run(past: list[Estimate | None]) -> tuple[np.ndarray, Float]:
+def _unbroken_run(past: list[Estimate | None]) -> tuple[Int, Float]:
     """The newest estimates that belong to one continuous track, poses all along and no jump between: stamps and poses.
 
     A reset shows as a jump of the pose, which ``/hat/status`` carries; the count of resets it does not.
     """
-    gaps = [i for i, estimate in enumerate(past) if estimate is None or not estimate.state.has_pose]
-    run = past[gaps[-1] + 1 if gaps else 0 :]
+    run: list[Estimate] = []
+    for estimate in reversed(past):
+        if estimate is None or not estimate.state.has_pose:
+            break
+        run.insert(0, estimate)
     T_cam_target = lie.matrix_from_row(np.stack([estimate.pose_row for estimate in run]))
     R = T_cam_target[:, :3, :3]
     jumps = np.flatnonzero(lie.angle_between(R[1:], R[:-1]) > np.radians(JUMP_DEG))
@@ -100,7 +103,7 @@ def _unbroken_run(past: list[Estimate | None]) -> tuple[np.ndarray, Float]:
     return np.array([estimate.stamp_ns for estimate in run[start:]], dtype=np.int64), T_cam_target[start:]
 
 
-def extrapolate(stamps_ns: np.ndarray, T_cam_target: Float, stamp_ns: int) -> Float:
+def extrapolate(stamps_ns: Int, T_cam_target: Float, stamp_ns: int) -> Float:
     """Pose at another time of a target that moves and turns at constant rate, as a (7,) row.
 
     The line through the poses in the tangent space of the newest is the componentwise Theil-Sen one (median of the
@@ -126,7 +129,7 @@ def extrapolate(stamps_ns: np.ndarray, T_cam_target: Float, stamp_ns: int) -> Fl
 
 
 @cache
-def _pairs(n: int) -> tuple[np.ndarray, ...]:
+def _pairs(n: int) -> tuple[Int, ...]:
     """Indices of all pairs of n, the earlier and the later one; n is small and hardly varies."""
     return np.triu_indices(n, k=1)
 

@@ -43,7 +43,7 @@ def test_a_planted_similarity_is_recovered(seed, n):
     np.testing.assert_allclose(alignment.current.R_target_slam, R_A, atol=1e-9)
     np.testing.assert_allclose(alignment.current.translation_m, t_A, atol=1e-7)
     for anchor, T_slam_cam in observations:
-        np.testing.assert_allclose(alignment.aligned(T_slam_cam), anchor, atol=1e-8)
+        np.testing.assert_allclose(alignment.current.target_in_camera(T_slam_cam), anchor, atol=1e-8)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -89,7 +89,7 @@ def test_gauge_and_scale_of_slam_change_nothing_in_metres():
         changed.append((anchor, T))
     a, b = _fitted(observations), _fitted(changed)
     for (_, T), (_, T_changed) in zip(observations, changed, strict=True):
-        np.testing.assert_allclose(a.aligned(T), b.aligned(T_changed), atol=1e-9)
+        np.testing.assert_allclose(a.current.target_in_camera(T), b.current.target_in_camera(T_changed), atol=1e-9)
 
 
 def test_schedule_first_at_three_then_every_ten_frames_anchor_or_not():
@@ -111,7 +111,7 @@ def test_a_stationary_target_keeps_scale_one_and_still_fits():
     T_slam_cam = lie.transform((T[:3, :3] @ R_A).T, np.zeros(3))
     alignment = _fitted([(T, T_slam_cam)] * 4)
     assert alignment.current.scale == 1.0
-    np.testing.assert_allclose(alignment.aligned(T_slam_cam), T, atol=1e-9)
+    np.testing.assert_allclose(alignment.current.target_in_camera(T_slam_cam), T, atol=1e-9)
 
 
 def test_scale_never_turns_negative():
@@ -150,7 +150,8 @@ class TestBoundedHistory:
         assert np.degrees(lie.angle_between(a.R_target_slam, b.R_target_slam)) < 0.02
         np.testing.assert_allclose(b.scale, a.scale, rtol=1e-3)
         T_slam_cam = observations[-1][1]
-        assert np.linalg.norm(full.aligned(T_slam_cam)[:3, 3] - bounded.aligned(T_slam_cam)[:3, 3]) < 0.01
+        moved = a.target_in_camera(T_slam_cam)[:3, 3] - b.target_in_camera(T_slam_cam)[:3, 3]
+        assert np.linalg.norm(moved) < 0.01
 
     def test_without_noise_folding_loses_nothing(self):
         observations, (scale, R_A, t_A) = _planted(4, 300)

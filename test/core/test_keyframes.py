@@ -67,9 +67,9 @@ def test_health_changes_nothing_with_a_factor_of_one():
 
 def test_an_attempt_on_something_else_is_soon_repeated():
     schedule = KeyframeSchedule(KeyframeConfig(gap_frames=6, settled_factor=3))
-    assert [i for i in range(20) if schedule.update(True, in_vain=i in (1, 2, 9, 10))] == [0, 2, 8, 10, 16]
+    assert [i for i in range(20) if schedule.update(True, failed=i in (1, 2, 9, 10))] == [0, 2, 8, 10, 16]
     schedule = _published(6)
-    assert [i for i in range(20) if schedule.update(True, in_vain=i > 0)] == [0, 6, 12, 18]
+    assert [i for i in range(20) if schedule.update(True, failed=i > 0)] == [0, 6, 12, 18]
 
 
 def test_frames_left_out_count_and_unsettle_the_track():

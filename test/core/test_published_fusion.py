@@ -116,7 +116,7 @@ class TestFusion:
             anchor = anchors.get(i)
             fused = fusion.advance(_motion(scene.observations.slam[i]), anchor, 1.0)
             poses.append(fused.T_cam_target)
-        S = [fusion.alignment.aligned(scene.observations.slam[i]) for i in (23, 24)]
+        S = [fusion.alignment.current.target_in_camera(scene.observations.slam[i]) for i in (23, 24)]
         M, predicted, w = anchors[24], S[1] @ lie.inverse(S[0]) @ poses[23], 0.1
 
         def residuals(x):

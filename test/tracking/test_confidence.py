@@ -1,4 +1,4 @@
-"""When the output's basin is beyond doubt: laws of core.confidence."""
+"""When the output's basin is certain: laws of tracking.confidence."""
 
 import numpy as np
 import pytest
@@ -30,26 +30,26 @@ def _after(*selections, output=RIGHT):
 
 
 def test_a_clear_lead_of_the_outputs_basin_is_needed():
-    assert _after(_selection(0.0, -CONFIG.min_margin)).vouches(confirmed=True)
-    assert not _after(_selection(0.0, -CONFIG.min_margin + 0.1)).vouches(confirmed=True)
+    assert _after(_selection(0.0, -CONFIG.min_margin)).is_certain(confirmed=True)
+    assert not _after(_selection(0.0, -CONFIG.min_margin + 0.1)).is_certain(confirmed=True)
 
 
 def test_a_lead_of_another_basin_speaks_against_the_output():
     confidence = _after(_selection(0.0, -20.0), output=WRONG)
     assert confidence.margin == -20.0
-    assert not confidence.vouches(confirmed=True)
+    assert not confidence.is_certain(confirmed=True)
 
 
 def test_without_confirmation_only_a_sure_lead_will_do():
-    assert _after(_selection(0.0, -CONFIG.sure_margin)).vouches(confirmed=False)
-    assert not _after(_selection(0.0, -CONFIG.sure_margin + 0.1)).vouches(confirmed=False)
+    assert _after(_selection(0.0, -CONFIG.sure_margin)).is_certain(confirmed=False)
+    assert not _after(_selection(0.0, -CONFIG.sure_margin + 0.1)).is_certain(confirmed=False)
 
 
 def test_appearance_must_agree_with_the_decoder_at_two_keyframes_in_a_row():
     clear, against = _selection(0.0, -10.0), _selection(0.0, -10.0, appearance_right=-1.0)
-    assert not _after(against).vouches(confirmed=True)
-    assert not _after(against, clear).vouches(confirmed=True)
-    assert _after(against, clear, clear).vouches(confirmed=True)
+    assert not _after(against).is_certain(confirmed=True)
+    assert not _after(against, clear).is_certain(confirmed=True)
+    assert _after(against, clear, clear).is_certain(confirmed=True)
 
 
 def test_frames_between_keyframes_change_nothing():
@@ -58,15 +58,15 @@ def test_frames_between_keyframes_change_nothing():
     assert before.margin == after.margin == 5.0
 
 
-def test_a_lead_over_nobody_is_none():
+def test_a_lead_without_a_competing_basin_is_none():
     alone = Selection(Candidates(lie.row_from_matrix(RIGHT[None]), np.zeros(1)), np.zeros(1), np.zeros(1), 0)
     assert _after(alone).margin == np.inf
-    assert not _after(alone).vouches(confirmed=False)
-    assert _after(alone).vouches(confirmed=True)
+    assert not _after(alone).is_certain(confirmed=False)
+    assert _after(alone).is_certain(confirmed=True)
 
 
 @pytest.mark.parametrize("output", [None, RIGHT])
 def test_nothing_is_known_before_the_first_keyframe(output):
     confidence = _after(Selection.none(), output=output)
     assert np.isnan(confidence.margin)
-    assert not confidence.vouches(confirmed=False)
+    assert not confidence.is_certain(confirmed=False)

@@ -119,7 +119,7 @@ def test_a_wrong_start_is_left_as_soon_as_the_anchors_say_so(scene):
 
 
 def test_a_locked_wrong_basin_is_left_when_the_image_prefers_the_anchor(scene):
-    """Settled in the wrong basin; the rival's lead decides at its first appearance."""
+    """Settled in the wrong basin; the competing basin's lead decides at its first appearance."""
     estimates = _run(_stage(scene), scene, range(120), lambda i, T: _flipped(T) if i < 56 else T)
     errors = _errors(estimates, scene, range(120))
     assert (errors[:56] > 170).all()
@@ -127,8 +127,8 @@ def test_a_locked_wrong_basin_is_left_when_the_image_prefers_the_anchor(scene):
 
 
 @pytest.mark.parametrize(("lead", "left"), [(1.0, 72), (6.0, 56)])
-def test_a_track_that_anchors_stood_for_is_not_left_for_one_that_barely_won(scene, lead, left):
-    """Whatever the image prefers; three such anchors outnumber the two that stood for the track."""
+def test_a_track_that_anchors_support_is_not_left_for_one_with_a_small_margin(scene, lead, left):
+    """Whatever the image prefers; three such anchors outnumber the two that support the track."""
     stage = _stage(scene)
     _run(stage, scene, range(16), lambda i, T: _flipped(T))
     _run(stage, scene, range(16, 56), lambda i, T: None)
@@ -147,7 +147,7 @@ def test_equal_evidence_leaves_the_decision_to_four_coherent_anchors(scene):
     assert (errors[80:] < 1e-5).all()
 
 
-def test_a_worse_rival_is_refused_however_coherent(scene):
+def test_a_worse_competing_basin_is_refused_however_coherent(scene):
     def worse(index):
         return {"true": (0.9, 0.9), "flipped": (0.7, 0.7)}
 
@@ -192,8 +192,8 @@ def test_an_uncertain_start_is_tracking_only_after_a_second_anchor_agreed(scene)
 
 
 @pytest.mark.parametrize(("n_missed", "in_doubt"), [(1, 0), (6, 6)])
-def test_after_an_interruption_somebody_must_speak_for_the_track_again(scene, n_missed, in_doubt):
-    """The target went on turning where nobody looked."""
+def test_after_an_interruption_the_track_needs_a_new_confirmation(scene, n_missed, in_doubt):
+    """The target went on turning between the frames."""
     frames = [*range(20), *range(20 + n_missed, 40)]
     estimates = _run(_stage(scene, lambda index: {"true": (0.85, 0.85)}), scene, frames)
     doubt = [i for i, e in zip(frames, estimates, strict=True) if i >= 8 and e.state != TrackState.TRACKING]
@@ -214,7 +214,7 @@ def test_a_mask_that_was_never_explained_well_needs_three_more_anchors(scene, ex
 
 
 @pytest.mark.parametrize(("apart_deg", "believed"), [(5.0, True), (20.0, False)])
-def test_an_anchor_far_from_where_the_track_expected_it_bears_no_witness(scene, apart_deg, believed):
+def test_an_anchor_far_from_its_prediction_is_no_confirmation(scene, apart_deg, believed):
     turn = lie.so3_exp(np.radians([apart_deg, 0.0, 0.0]))
     anchor = lambda i, T: T if i == 0 else lie.transform(turn @ T[:3, :3], T[:3, 3])  # noqa: E731
     stage = _stage(scene, evidence=lambda index: {"true": (0.85, 0.85)})
@@ -223,7 +223,7 @@ def test_an_anchor_far_from_where_the_track_expected_it_bears_no_witness(scene, 
 
 
 def test_a_track_that_anchors_contradict_is_in_doubt_until_two_agree(scene):
-    """Rivals without image support and without coherence: nothing to follow, but no certainty either."""
+    """Competing basins without image support and without coherence: nothing to follow, but no certainty either."""
     turns = {40: [np.pi, 0, 0], 48: [0, 0, np.pi]}
 
     def anchor(i, T):
@@ -235,8 +235,8 @@ def test_a_track_that_anchors_contradict_is_in_doubt_until_two_agree(scene):
     assert (_errors(estimates, scene, range(72)) < 1e-5).all()
 
 
-def test_a_rival_must_outnumber_the_anchors_behind_the_track(scene):
-    """Equal evidence: more coherent rivals than anchors stood for the track, its first included; four at most."""
+def test_a_competing_basin_must_outnumber_the_anchors_behind_the_track(scene):
+    """Equal evidence: more coherent anchors than support the track, its first included; four at most."""
 
     def equal(index):
         return {"true": (0.9, 0.9), "flipped": (0.9, 0.9)}
@@ -249,8 +249,8 @@ def test_a_rival_must_outnumber_the_anchors_behind_the_track(scene):
         assert (errors[switched_at:] < 1e-5).all()
 
 
-def test_anchors_that_no_image_has_supported_stand_for_no_track(scene):
-    """While the masks were wrong, what agreed was wrong alike: the first supported rival wins, however narrowly."""
+def test_anchors_that_no_image_has_supported_support_no_track(scene):
+    """While the masks were wrong, what agreed was wrong alike: the first supported basin wins, however narrowly."""
 
     def masked_well(index):
         return {"true": (0.9, 0.9)} if index >= 40 else {}

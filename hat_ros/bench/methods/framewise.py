@@ -11,9 +11,9 @@ from hat_ros.hypotheses.stage import HypothesisStage
 from hat_ros.motion.stage import MotionStage
 from hat_ros.refinement.contour_refiner import ContourRefiner
 from hat_ros.segmentation.stage import SegmentationStage
+from hat_ros.stages import PoseRefiner
 from hat_ros.target.model import Target
 from hat_ros.tracker import HatTracker, StageWrapper, Step
-from hat_ros.tracking.refiner import Refiner
 from hat_ros.types import Candidates, Detection, Estimate, Frame, Motion, Refined, Selection, TrackState
 
 _NO_POSE = np.full(7, np.nan)
@@ -96,7 +96,7 @@ class Tracking:
 class _LastPose:
     """The track of :class:`Tracking`."""
 
-    def __init__(self, refiner: Refiner) -> None:
+    def __init__(self, refiner: PoseRefiner) -> None:
         self._refiner = refiner
         self._T_cam_target: np.ndarray | None = None
 
