@@ -1,7 +1,7 @@
 """Reference pages from the code: MkDocs calls the hooks at the end of this file while it builds the site.
 
-A page says where a table goes by a comment, ``<!-- generated: topics -->``. What each topic is for stands here, since
-the code needs only its name and type; a topic that is missing here stops the build.
+A page says where a table goes by a comment, ``<!-- generated: topics -->``, and a file by ``<!-- file: PATH -->``. What
+each topic is for stands here, since the code needs only its name and type; one that is missing here stops the build.
 """
 
 from __future__ import annotations
@@ -207,12 +207,18 @@ GENERATORS: dict[str, Callable[[], str]] = {
     "n_sections": lambda: str(len(config_to_dict(HatConfig()))),
 }
 _MARK = re.compile(r"<!-- generated: (\w+) -->")
+_FILE = re.compile(r"<!-- file: (\S+) -->")
 _ROLE = re.compile(r":(?:class|mod|func|meth|attr|data|exc):<code>~?([^<]*)</code>")
 
 
 def fill(markdown: str) -> str:
     """Markdown with every mark replaced by what it names."""
-    return _MARK.sub(lambda found: GENERATORS[found[1]](), markdown)
+    markdown = _MARK.sub(lambda found: GENERATORS[found[1]](), markdown)
+    return _FILE.sub(lambda found: _listing(ROOT / found[1]), markdown)
+
+
+def _listing(path: Path) -> str:
+    return f"```python\n{path.read_text(encoding='utf-8')}```"
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:

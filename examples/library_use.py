@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from hat_ros import Camera, Estimate, Frame, HatTracker, load_config, load_target
-from hat_ros.io.bag import BagReader
+from hat_ros.io.bag_reader import BagReader
 
 
 def estimates(frames: Iterable[Frame], target_file: Path) -> Iterable[Estimate]:

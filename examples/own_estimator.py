@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hat_ros import Camera, Detection, Frame, HatConfig, HatTracker, Target, load_config, load_target
-from hat_ros.io.bag import BagReader
+from hat_ros.io.bag_reader import BagReader
 from hat_ros.stages import BACKENDS
 from hat_ros.target.rendering import create_renderer
 from hat_ros.types import Candidates, PosePrior
@@ -35,7 +35,7 @@ class SilhouetteHypotheses:
     def __init__(self, config: HatConfig, target: Target) -> None:
         self._n_best = config.hypotheses.max_candidates
         self._target = target
-        self._renderer = create_renderer("embree", target)
+        self._renderer = create_renderer("rays", target)
         self._views = Rotation.random(N_VIEWS, rng=np.random.default_rng(1))
 
     def generate(self, frame: Frame, detection: Detection, prior: PosePrior | None) -> Candidates:

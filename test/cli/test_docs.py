@@ -10,7 +10,7 @@ from hat_ros.bench.experiments.comparison import Entry
 from hat_ros.cli import build_parser
 
 ROOT = Path(__file__).parents[2]
-PAGES = ("README.md", "docs/benchmark.md")
+PAGES = ("README.md", "CONTRIBUTING.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md"))))
 
 
 def commands(page: str) -> list[str]:
@@ -23,7 +23,7 @@ def commands(page: str) -> list[str]:
     return [
         line
         for line in lines
-        if line.startswith("hat ") and not {"...", "--help"} & {*line.split()} and len(line.split()) > 2
+        if line.startswith("hat ") and not {"...", "--help", "needs"} & {*line.split()} and len(line.split()) > 2
     ]
 
 

@@ -9,18 +9,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rclpy
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from sensor_msgs.msg import PointCloud2
 
-from hat_ros.io.messages import Wire
+from hat_ros.io.messages import Admitted, Wire
 from hat_ros.ros.domain import reserved_domain
+from hat_ros.types import Estimate, TrackState
 
-README = Path(__file__).parents[2] / "README.md"
+ROOT = Path(__file__).parents[2]
+STAMP_NS, ROW = 5_000_000_000, np.array([0.1, 0.2, 7.25, 0.0, 0.0, 0.0, 1.0])
 
 
-@pytest.mark.graph
-def test_the_ten_line_subscriber_prints_poses(tmp_path):
-    script = tmp_path / "gnc.py"
-    script.write_text(re.search(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL).group(1))
+def readme_script() -> str:
+    """The first block of Python that spins."""
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    return next(block for block in blocks if "rclpy.spin" in block)
+
+
+def lines_of(script: Path, n: int) -> list[str]:
+    """What a subscriber prints about a pose and its status."""
     with reserved_domain(None) as domain:
         environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
         subscriber = subprocess.Popen(
@@ -30,19 +37,43 @@ def test_the_ten_line_subscriber_prints_poses(tmp_path):
         rclpy.init(args=[], context=context, domain_id=domain)
         try:
             node = rclpy.create_node("source", context=context)
-            publisher = node.create_publisher(PoseStamped, "/target_pose", 10)
-            message = Wire.ros().pose(5_000_000_000, "camera", np.array([0.1, 0.2, 7.25, 0.0, 0.0, 0.0, 1.0]))
+            poses = node.create_publisher(PoseWithCovarianceStamped, "/target_pose_with_covariance", 10)
+            statuses = node.create_publisher(PointCloud2, "/hat/status", 10)
+            wire, covariance = Wire.ros(), np.diag([1e-4, 1e-4, 4e-4, 1e-5, 1e-5, 1e-5])
             executor = rclpy.executors.SingleThreadedExecutor(context=context)
             executor.add_node(node)
             for _ in range(600):
-                if publisher.get_subscription_count():
+                if poses.get_subscription_count() and statuses.get_subscription_count():
                     break
                 executor.spin_once(timeout_sec=0.05)
                 assert subscriber.poll() is None, subscriber.stderr.read()
-            publisher.publish(message)
-            line = subscriber.stdout.readline()
+            poses.publish(wire.pose_with_covariance(STAMP_NS, "camera", ROW, covariance))
+            for _ in range(10):
+                executor.spin_once(timeout_sec=0.05)
+            for stamp_ns, state, row in (
+                (STAMP_NS, TrackState.TRACKING, ROW),
+                (STAMP_NS + 1, TrackState.LOST, np.full(7, np.nan)),
+            ):
+                estimate = Estimate(stamp_ns, state, row, covariance)
+                statuses.publish(wire.status("camera", estimate, Admitted(0, 0, 0)))
+            return [subscriber.stdout.readline() for _ in range(n)]
         finally:
             subscriber.kill()
             subscriber.communicate()
             rclpy.shutdown(context=context)
-    assert "range 7.250 m" in line
+
+
+@pytest.mark.graph
+def test_the_short_subscriber_prints_state_and_range(tmp_path):
+    script = tmp_path / "gnc.py"
+    script.write_text(readme_script(), encoding="utf-8")
+    tracking, lost = lines_of(script, 2)
+    assert tracking == "state 1 range 7.250 m\n"
+    assert lost == "state 3 range None\n"
+
+
+@pytest.mark.graph
+def test_the_example_node_joins_pose_and_state():
+    tracking, lost = lines_of(ROOT / "examples" / "gnc_node.py", 2)
+    assert "TRACKING: range 7.250 m +- 0.020" in tracking
+    assert "LOST: no pose, hold" in lost
