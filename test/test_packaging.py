@@ -89,7 +89,7 @@ def test_every_declared_package_is_imported():
 def test_pins_lie_within_the_bounds():
     pins = requirements("requirements.txt", "requirements-nets.txt", "requirements-test.txt")
     stated = PROJECT["dependencies"] + [
-        text for extra in ("ros", "nets", "cluster") for text in PROJECT["optional-dependencies"][extra]
+        text for extra in ("ros", "nets") for text in PROJECT["optional-dependencies"][extra]
     ]
     for need in map(Requirement, stated):
         (pin,) = pins[canonicalize_name(need.name)].specifier

@@ -33,7 +33,7 @@ _REQUIRED = {
     "matplotlib": "matplotlib",
     "PIL": "pillow",
 }
-_OPTIONAL = {"torch": "nets", "transformers": "nets", "safetensors": "nets", "pyrender": "gl", "distributed": "cluster"}
+_OPTIONAL = {"torch": "nets", "transformers": "nets", "safetensors": "nets", "pyrender": "gl"}
 
 
 @dataclass(frozen=True)

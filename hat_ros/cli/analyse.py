@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hat_ros.cli.options import Commands, add_dataset, add_extent, add_out, spec_of
+from hat_ros.cli.options import Commands, add_dataset, add_extent, add_out, extent_of, spec_of
 
 
 def add_commands(commands: Commands) -> None:
@@ -85,15 +85,7 @@ def _score(arguments: argparse.Namespace) -> int:
     from hat_ros.bench.runs.external import ScoreOptions, score_poses
     from hat_ros.cli.console import print_figures
 
-    options = ScoreOptions(
-        method=arguments.method,
-        fps=arguments.fps,
-        start=arguments.start,
-        limit=arguments.limit,
-        video=not arguments.no_video,
-        report=not arguments.no_report,
-        overwrite=arguments.overwrite,
-    )
+    options = ScoreOptions(method=arguments.method, fps=arguments.fps, **extent_of(arguments))
     folder = score_poses(spec_of(arguments), arguments.poses, arguments.out, options)
     if not arguments.quiet:
         print_figures(folder)

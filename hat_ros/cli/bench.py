@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hat_ros.bench.methods.modes import MODES
 from hat_ros.cli.options import Commands, add_config, add_dataset, natural, positive
-from hat_ros.cli.run import MODES
 
 if TYPE_CHECKING:
     from hat_ros.bench.source import SourceSpec
@@ -39,11 +39,6 @@ def _add_run_matrix(parser: argparse.ArgumentParser) -> None:
     add_config(parser)
     parser.add_argument("--limit", type=positive, metavar="N", help="at most N frames per run")
     parser.add_argument("--jobs", type=positive, default=1, metavar="N", help="runs at a time (default: 1)")
-    parser.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="run on the workers of this Dask scheduler instead (extra `cluster`; shared file system)",
-    )
 
 
 def _clips(arguments: argparse.Namespace) -> list[tuple[SourceSpec, tuple[str, ...]]]:
@@ -156,7 +151,6 @@ def _add_bench(commands: Commands) -> None:
         help="a row for a method that is not ours, from its file of poses (see `hat score`); {clip} in FILE stands for "
         "the clip's name (repeatable)",
     )
-    parser.add_argument("--stages", action="store_true", help="print the time per stage as well")
     parser.set_defaults(command=_bench)
 
 
@@ -181,7 +175,7 @@ def _bench(arguments: argparse.Namespace) -> int:
     )
     out = arguments.out.resolve()
     with matrix_progress(len(jobs)) as watch:
-        outcomes = run_jobs(jobs, out, arguments.jobs, arguments.scheduler, watch)
+        outcomes = run_jobs(jobs, out, arguments.jobs, watch)
     table, stages, groups = (
         comparison.bench_table(outcomes),
         comparison.stage_table(outcomes),
@@ -195,8 +189,6 @@ def _bench(arguments: argparse.Namespace) -> int:
             (out / f"groups.{form}").write_bytes(image_bytes(bench_figure(groups.rows, "group"), form))
     print(table.text())
     print(groups.text())
-    if arguments.stages:
-        print(stages.text())
     failures = comparison.failures(outcomes)
     for line in failures:
         print(f"failed: {line}", file=sys.stderr)
@@ -210,7 +202,7 @@ tables, each as NAME.txt, .csv, .tex, .json, .png and .svg below --out:
   selectors     best appearance, the decoder, the offline backtrace, and a particle filter and a UKF at their best
   filters       the search for that best
   offline       independent, causal and offline poses from the same observations
-  by_clip       the same, E_p clip by clip
+  by_clip       the same, E_p clip by clip (no figure)
   masks         motion from the masked target and from raw frames
   candidates    best of the K candidates of every image, clip by clip (no figure)
   ranges        errors of the best appearance by range
@@ -246,7 +238,7 @@ def _ablate(arguments: argparse.Namespace) -> int:
         _clips(arguments), out, arguments.config, arguments.front_end, arguments.overrides, arguments.limit
     )
     with matrix_progress(len(plan.jobs)) as watch:
-        outcomes = run_jobs(plan.jobs, out, arguments.jobs, arguments.scheduler, watch)
+        outcomes = run_jobs(plan.jobs, out, arguments.jobs, watch)
     for name, table in ablation.tables(plan, outcomes).items():
         table.write(out, name)
         for form in ("png", "svg"):

@@ -54,7 +54,6 @@ def _add_import(commands: Commands) -> None:
         "or NAME/ for each",
     )
     parser.add_argument("--check", action="store_true", help="also write a picture of the CAD projected by the labels")
-    parser.add_argument("--renderer", choices=("rays", "pyrender"), default="rays", help="what draws that picture")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(command=_import)
 
@@ -73,7 +72,6 @@ def _import(arguments: argparse.Namespace) -> int:
             boxes=arguments.boxes,
             detections=arguments.detections,
             check=arguments.check,
-            renderer=arguments.renderer,
             progress=watch,
         )
     for bag in bags:
@@ -94,8 +92,7 @@ def _add_synth(commands: Commands) -> None:
     parser.add_argument(
         "--format", choices=("bag", "sequence"), default="bag", help="rosbag2 folder or images + labels"
     )
-    parser.add_argument("--scale", type=float, default=1.0, metavar="S", help="image size of clips and suite, times S")
-    parser.add_argument("--width", type=positive, metavar="PX", help="images of the suite at most this wide")
+    parser.add_argument("--width", type=positive, metavar="PX", help="named clips and suite: images at most this wide")
     parser.add_argument("--limit", type=positive, metavar="N", help="at most N frames per clip of the suite")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     film = parser.add_argument_group("how a model is filmed")
@@ -151,11 +148,9 @@ def _synth(arguments: argparse.Namespace) -> int:
         raise UsageError("synth: --out is missing; it names what to write")
     with count_progress(arguments.quiet) as watch:
         if what == "suite":
-            size = {"scale": arguments.scale, "width_px": arguments.width, "limit": arguments.limit}
-            groups = suite.write_suite(arguments.out, **size, progress=watch)
-            written = [bag for bags in groups.values() for bag in bags]
+            written = suite.write_suite(arguments.out, arguments.width, arguments.limit, watch)
         else:
-            clip = suite.CLIPS[what].scaled(arguments.scale) if what in suite.CLIPS else _filmed(arguments)
+            clip = suite.CLIPS[what].within(arguments.width) if what in suite.CLIPS else _filmed(arguments)
             written = [suite.synthesize(clip, arguments.out, arguments.format == "bag", watch)]
     for path in written:
         print(path)

@@ -89,6 +89,17 @@ def add_extent(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress bar, no table")
 
 
+def extent_of(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What :func:`add_extent` and :func:`add_out` say, as ``hat_ros.bench.runs.folder.RunOptions`` takes it."""
+    return {
+        "start": arguments.start,
+        "limit": arguments.limit,
+        "video": not arguments.no_video,
+        "report": not arguments.no_report,
+        "overwrite": arguments.overwrite,
+    }
+
+
 def add_threads(parser: argparse.ArgumentParser) -> None:
     """``--threads``."""
     parser.add_argument(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from hat_ros.bench.methods.modes import MODES
 from hat_ros.cli.options import (
     Commands,
     add_config,
@@ -13,13 +14,12 @@ from hat_ros.cli.options import (
     add_out,
     add_threads,
     config_of,
+    extent_of,
     limit_threads,
     natural,
     positive,
     spec_of,
 )
-
-MODES = ("hat", "independent", "tracking", "offline", "srt3d", "observe")
 
 
 def add_commands(commands: Commands) -> None:
@@ -77,11 +77,7 @@ def _replay(arguments: argparse.Namespace) -> int:
         live=arguments.live,
         rate=arguments.rate,
         domain=arguments.domain,
-        start=arguments.start,
-        limit=arguments.limit,
-        video=not arguments.no_video,
-        report=not arguments.no_report,
-        overwrite=arguments.overwrite,
+        **extent_of(arguments),
     )
     with state_progress("replaying", arguments.quiet) as watch:
         folder = replay_bag(arguments.bag, arguments.out, config_of(arguments), options, watch)
@@ -126,11 +122,7 @@ def _track(arguments: argparse.Namespace) -> int:
     options = TrackOptions(
         mode=arguments.mode,
         credits=arguments.credits,
-        start=arguments.start,
-        limit=arguments.limit,
-        video=not arguments.no_video,
-        report=not arguments.no_report,
-        overwrite=arguments.overwrite,
+        **extent_of(arguments),
     )
     with state_progress("tracking", arguments.quiet) as watch:
         folder = track(spec, arguments.out, config_of(arguments), options, watch)
@@ -150,7 +142,12 @@ def _add_temporal(commands: Commands) -> None:
     parser.add_argument("observations", type=Path, metavar="OBS.npz", help="recorded observations")
     parser.add_argument("--out", required=True, type=Path, metavar="OUT.npz", help="file to write")
     add_config(parser)
-    parser.add_argument("--offline", action="store_true", help="the offline reference: all frames jointly, not causal")
+    parser.add_argument(
+        "--mode",
+        choices=("hat", "offline"),
+        default="hat",
+        help="hat: causal; offline: all frames jointly, whole-clip smoothing (default: hat)",
+    )
     parser.set_defaults(command=_temporal)
 
 
@@ -158,7 +155,7 @@ def _temporal(arguments: argparse.Namespace) -> int:
     from hat_ros.bench.methods.temporal import run_offline, run_temporal, save_result
     from hat_ros.bench.observations import load_observations
 
-    run = run_offline if arguments.offline else run_temporal
+    run = run_offline if arguments.mode == "offline" else run_temporal
     config = config_of(arguments)
     save_result(arguments.out, run(load_observations(arguments.observations), config))
     return 0

@@ -7,10 +7,13 @@ import sys
 import numpy as np
 import pytest
 from scripted import CAMERA, ScriptedMethod, frame, mask, stamp, true_row
+from temporal_scene import make_scene
 
 from hat_ros.bench.datasets.importer import FORMATS
+from hat_ros.bench.methods.temporal import run_offline, run_temporal
 from hat_ros.bench.synth.models import write_model
-from hat_ros.cli import build_parser, data, main, run
+from hat_ros.cli import build_parser, data, main
+from hat_ros.config import load_config
 from hat_ros.errors import RunError
 from hat_ros.geometry import lie
 from hat_ros.io.bag_writer import BagWriter
@@ -78,9 +81,6 @@ def test_commands_are_all_listed():
 
 
 def test_choices_repeated_for_a_light_start_are_the_real_ones():
-    from hat_ros.bench.methods.modes import MODES
-
-    assert run.MODES == MODES
     assert tuple(FORMATS) == data.FORMATS
 
 
@@ -258,3 +258,15 @@ def test_weights_list_names_source_and_licence(capsys, monkeypatch):
     text = capsys.readouterr().out
     assert "droid.pth" in text
     assert "BSD-3" in text
+
+
+def test_temporal_answers_causally_or_over_the_whole_clip(tmp_path):
+    scene = make_scene(40, noise_deg=3.0)
+    np.savez(tmp_path / "obs.npz", **vars(scene.observations))
+    for mode, run in (("hat", run_temporal), ("offline", run_offline)):
+        command = ["temporal", str(tmp_path / "obs.npz"), "--config", "mega_hat", "--mode", mode]
+        assert main([*command, "--out", str(tmp_path / f"{mode}.npz")]) == 0
+        expected = run(scene.observations, load_config("mega_hat"))
+        with np.load(tmp_path / f"{mode}.npz") as written:
+            np.testing.assert_array_equal(written["T_cam_target"], expected.T_cam_target)
+            assert {"T_cam_target", "chosen", "accepted", "resets"} <= set(written)

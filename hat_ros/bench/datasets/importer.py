@@ -82,7 +82,6 @@ def import_dataset(
     boxes: bool = False,
     detections: str | Path | None = None,
     check: bool = False,
-    renderer: str = "rays",
     progress: Progress | None = None,
 ) -> list[Path]:
     """Write bags: ``out`` itself for the ``sequence`` format, ``out/NAME`` per sequence otherwise.
@@ -98,7 +97,6 @@ def import_dataset(
         detections: masks or boxes computed elsewhere instead of the data set's own, see :func:`with_detections`; a
             folder with ``NAME`` or ``NAME.json`` for each sequence, or what there is of the only one.
         check: also write ``NAME.check.png`` beside each bag, see :func:`check_picture`.
-        renderer: what draws it, see :func:`hat_ros.target.rendering.create_renderer`.
         progress: called with (sequence, frames done, frames in all).
 
     Returns:
@@ -128,7 +126,7 @@ def import_dataset(
         elif progress is not None:
             progress(recording.name, len(recording), len(recording))
         if check:
-            picture = check_picture(recording, renderer_name=renderer)
+            picture = check_picture(recording)
             cv2.imwrite(str(bag.with_name(f"{bag.name}.check.png")), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
         bags.append(bag)
     return bags
@@ -258,7 +256,7 @@ def with_detections(recording: ImageRecording, path: Path) -> ImageRecording:
     return replace(recording, detections=lookup)
 
 
-def check_picture(recording: ImageRecording, width_px: int = 640, renderer_name: str = "rays") -> UInt8:
+def check_picture(recording: ImageRecording, width_px: int = 640) -> UInt8:
     """First, middle and last labelled frame over the CAD rendered at the true pose, outlined in green: (H, W, 3) RGB.
 
     Wrong units, quaternion order, frames or axes show at once: the outline misses the target. A mirrored or turned
@@ -266,12 +264,11 @@ def check_picture(recording: ImageRecording, width_px: int = 640, renderer_name:
 
     Raises:
         DatasetError: the recording has no truth.
-        MissingDependencyError: see ``create_renderer``.
     """
     labelled = [item for item in recording.files if item.T_cam_target is not None]
     if not labelled:
         raise DatasetError(f"{recording.name}: no frame has a true pose, nothing to check")
-    renderer = create_renderer(renderer_name, load_target(recording.target_path, recording.unit_scale))
+    renderer = create_renderer("rays", load_target(recording.target_path, recording.unit_scale))
     columns = []
     for item in (labelled[0], labelled[len(labelled) // 2], labelled[-1]):
         rgb = recording.frame(item).rgb.copy()

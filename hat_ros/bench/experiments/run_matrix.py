@@ -11,7 +11,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from functools import cache
@@ -29,7 +29,6 @@ _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NU
 
 
 GRAPH = "graph"
-CONNECT_TIMEOUT_S = 10
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,6 @@ def run_jobs(
     jobs: Sequence[Job],
     out: Path,
     n_jobs: int = 1,
-    scheduler: str | None = None,
     watch: Callable[[Outcome], None] | None = None,
 ) -> list[Outcome]:
     """Run what is not done yet, ``n_jobs`` at a time; one job's failure does not stop the others.
@@ -124,8 +122,7 @@ def run_jobs(
     Args:
         jobs: with unique names.
         out: folder of the runs; runs go to ``out/runs/<job name>``.
-        n_jobs: processes at a time on this machine.
-        scheduler: address of a Dask scheduler that shares this file system; its workers run the jobs instead.
+        n_jobs: processes at a time.
         watch: called with each outcome as it comes.
 
     Returns:
@@ -134,7 +131,6 @@ def run_jobs(
     Raises:
         ConfigError: a job's configuration is bad; nothing runs then.
         RunError: the folder of the runs cannot be written.
-        MissingDependencyError: a scheduler is asked for but ``distributed`` is not installed.
     """
     work = [(job, out / "runs" / job.name, job.fingerprint()) for job in jobs]
     runs = out / "runs"
@@ -142,12 +138,17 @@ def run_jobs(
         runs.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(f"cannot create {runs}: {error.strerror}") from None
-    execute = _on_this_machine(n_jobs) if scheduler is None else _on_cluster(scheduler)
     outcomes: dict[str, Outcome] = {}
-    for outcome in execute(work):
-        outcomes[outcome.job.name] = outcome
-        if watch is not None:
-            watch(outcome)
+    with ThreadPoolExecutor(n_jobs) as pool:
+        try:
+            for future in as_completed([pool.submit(run_job, *item) for item in work]):
+                outcome = future.result()
+                outcomes[outcome.job.name] = outcome
+                if watch is not None:
+                    watch(outcome)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
     return [outcomes[job.name] for job in jobs]
 
 
@@ -171,44 +172,3 @@ def _finished(folder: Path, fingerprint: dict[str, Any]) -> dict[str, Any] | Non
     except (OSError, ValueError):
         return None
     return figures if all(run.get(key) == value for key, value in fingerprint.items()) else None
-
-
-Work = Sequence[tuple[Job, Path, dict[str, Any]]]
-
-
-def _on_this_machine(n_jobs: int) -> Callable[[Work], Iterator[Outcome]]:
-    def execute(work: Work) -> Iterator[Outcome]:
-        with ThreadPoolExecutor(n_jobs) as pool:
-            try:
-                futures = [pool.submit(run_job, *item) for item in work]
-                for future in as_completed(futures):
-                    yield future.result()
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
-
-    return execute
-
-
-def _on_cluster(address: str) -> Callable[[Work], Iterator[Outcome]]:
-    try:
-        from distributed import Client
-        from distributed import as_completed as as_completed_there
-    except ModuleNotFoundError:
-        from hat_ros.errors import MissingDependencyError
-
-        raise MissingDependencyError(
-            "--scheduler needs the package 'distributed', which is not installed: pip install 'hat_ros[cluster]'"
-        ) from None
-
-    def execute(work: Work) -> Iterator[Outcome]:
-        try:
-            client = Client(address, timeout=CONNECT_TIMEOUT_S)
-        except OSError as error:
-            raise RunError(f"no Dask scheduler answers at {address} ({error})") from None
-        with client:
-            futures = [client.submit(run_job, *item, pure=False, retries=1) for item in work]
-            for future in as_completed_there(futures):
-                yield future.result()
-
-    return execute

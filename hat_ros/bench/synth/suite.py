@@ -7,7 +7,6 @@ those of the data sets; ranges are scaled to the size of our models, so that the
 from __future__ import annotations
 
 import shutil
-from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -38,20 +37,14 @@ class Clip:
 
     def within(self, width_px: int | None) -> Clip:
         """The same view with images at most this wide; None = any width."""
-        return self if width_px is None else self.scaled(min(1.0, width_px / self.spec.width))
-
-    def scaled(self, scale: float) -> Clip:
-        """The same view with images ``scale`` times the size."""
         spec = self.spec
-        return replace(
-            self,
-            spec=replace(
-                spec,
-                width=round(spec.width * scale),
-                height=round(spec.height * scale),
-                focal_px=spec.focal_px * scale,
-            ),
+        if width_px is None or width_px >= spec.width:
+            return self
+        scale = width_px / spec.width
+        small = replace(
+            spec, width=round(spec.width * scale), height=round(spec.height * scale), focal_px=spec.focal_px * scale
         )
+        return replace(self, spec=small)
 
 
 _SPARK = ClipSpec(
@@ -86,8 +79,6 @@ CLIPS: dict[str, Clip] = {
     "demo": DEMO,
     "spark_observer": Clip("observer", _SPARK, 0.6),
     "spark_far": Clip("observer", replace(_SPARK, range_m=(16.0, 9.0), start_rotvec=(1.9, -0.4, 0.8), seed=1), 0.6),
-    # Not in the suite: from most sides it looks exactly like its half-turned self, so an error says nothing.
-    "spark_freighter": Clip("freighter", replace(_SPARK, range_m=(22.0, 9.0), start_rotvec=(1.9, -0.4, 0.8), seed=1)),
     "shirt_synthetic": Clip("probe", _SHIRT),
     "shirt_lightbox": Clip(
         "probe",
@@ -116,17 +107,6 @@ SUITE_SETTINGS: dict[str, tuple[str, ...]] = {
     "swisscube": ("segmentation.backend=annotated",),
     "ycbv": ("segmentation.backend=annotated", "slam.masked=false"),
 }
-
-
-def get_clip(name: str) -> Clip:
-    """A clip by name.
-
-    Raises:
-        UsageError: unknown name.
-    """
-    if name not in CLIPS:
-        raise UsageError(f"clip '{name}' does not exist, known are {', '.join(CLIPS)}")
-    return CLIPS[name]
 
 
 def synthesize(clip: Clip, out: str | Path, as_bag: bool = True, progress: Progress | None = None) -> Path:
@@ -164,41 +144,26 @@ def synthesize(clip: Clip, out: str | Path, as_bag: bool = True, progress: Progr
 
 
 def write_suite(
-    out: str | Path,
-    groups: Collection[str] = tuple(SUITE),
-    *,
-    scale: float = 1.0,
-    width_px: int | None = None,
-    limit: int | None = None,
-    progress: Progress | None = None,
-) -> dict[str, list[Path]]:
+    out: str | Path, width_px: int | None = None, limit: int | None = None, progress: Progress | None = None
+) -> list[Path]:
     """Render the benchmark into ``out/GROUP/CLIP`` bags; those that exist are left alone.
 
     Args:
         out: folder to fill.
-        groups: keys of :data:`SUITE`.
-        scale: image size relative to the data set's.
         width_px: images at most this wide, so that no data set costs more per frame than another; None = any width.
         limit: at most this many frames per clip, over the whole approach.
         progress: see :func:`synthesize`.
 
     Returns:
-        Group -> bags.
-
-    Raises:
-        UsageError: unknown group.
+        The bags.
     """
-    bags: dict[str, list[Path]] = {}
-    for group in groups:
-        if group not in SUITE:
-            raise UsageError(f"suite '{group}' does not exist, known are {', '.join(SUITE)}")
-        bags[group] = []
-        for name in SUITE[group]:
-            bag = Path(out) / group / name
-            clip = CLIPS[name].scaled(scale).within(width_px)
+    bags = []
+    for group, names in SUITE.items():
+        for name in names:
+            bag, clip = Path(out) / group / name, CLIPS[name].within(width_px)
             if limit is not None:
                 clip = replace(clip, spec=replace(clip.spec, frames=min(limit, clip.spec.frames)))
-            bags[group].append(bag if bag.exists() else synthesize(clip, bag, progress=progress))
+            bags.append(bag if bag.exists() else synthesize(clip, bag, progress=progress))
     return bags
 
 

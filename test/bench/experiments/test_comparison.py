@@ -1,4 +1,4 @@
-"""Campaigns: resumable, isolated failures, tables with the same bytes."""
+"""Many runs: resumable, isolated failures, tables with the same bytes."""
 
 import json
 from pathlib import Path
@@ -20,7 +20,7 @@ from hat_ros.bench.experiments.comparison import (
 )
 from hat_ros.bench.experiments.run_matrix import Job, run_jobs
 from hat_ros.bench.synth.models import write_model
-from hat_ros.errors import MissingDependencyError, RunError, UsageError
+from hat_ros.errors import UsageError
 from hat_ros.geometry import lie
 from hat_ros.io.bag_writer import BagWriter
 from hat_ros.io.results import METRICS_FILE, RUN_FILE
@@ -229,13 +229,6 @@ def test_graph_runs_go_through_replay_and_compare_with_track(clips):
     assert job.fingerprint()["mode"] == "hat"
 
 
-def test_scheduler_without_distributed_says_what_to_install(clips, tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "distributed", None)
-    jobs = make(clips, {})
-    with pytest.raises(MissingDependencyError, match=r"hat_ros\[cluster\]"):
-        run_jobs(jobs, tmp_path / "bench", scheduler="tcp://127.0.0.1:1")
-
-
 def test_bad_configuration_is_found_before_anything_runs(clips, fake_runs, tmp_path):
     from hat_ros.errors import ConfigError
 
@@ -246,41 +239,9 @@ def test_bad_configuration_is_found_before_anything_runs(clips, fake_runs, tmp_p
     assert log == []
 
 
-@pytest.fixture
-def cluster(request):
-    distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=request.param, dashboard_address=None, silence_logs=50
-    ) as cluster:
-        yield cluster.scheduler_address
-
-
-@pytest.mark.parametrize("cluster", [False], indirect=True)
-def test_cluster_of_two_workers_runs_and_resumes_a_run_matrix(clips, fake_runs, tmp_path, cluster):
-    log, broken, registry = fake_runs
-    jobs = make(clips, registry)
-    broken.add(jobs[2].name)
-    outcomes = run_jobs(jobs, tmp_path / "bench", scheduler=cluster)
-    assert failures(outcomes) == [f"{jobs[2].name}: hat: the bag is damaged"]
-    broken.clear()
-    first = run_jobs(jobs, tmp_path / "bench", scheduler=cluster)
-    again = run_jobs(jobs, tmp_path / "bench")
-    assert len(log) == len(jobs) + 1
-    assert bench_table(again).csv() == bench_table(first).csv()
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("cluster", [True], indirect=True)
-def test_real_runs_in_worker_processes(clips, tmp_path, cluster):
-    options = {"limit": 1, "overrides": ["segmentation.backend=classical"]}
-    jobs = make(clips, {}, modes=["independent"], **options)
-    outcomes = run_jobs(jobs, tmp_path / "bench", scheduler=cluster)
+def test_real_runs_two_at_a_time(clips, tmp_path):
+    jobs = make(clips, {}, modes=["independent"], limit=1, overrides=["segmentation.backend=classical"])
+    outcomes = run_jobs(jobs, tmp_path / "bench", n_jobs=2)
     assert failures(outcomes) == []
     assert [outcome.figures["frames"] for outcome in outcomes] == [1, 1]
-
-
-def test_scheduler_that_does_not_answer(clips, tmp_path, monkeypatch):
-    pytest.importorskip("distributed")
-    monkeypatch.setattr(run_matrix, "CONNECT_TIMEOUT_S", 1)
-    with pytest.raises(RunError, match="no Dask scheduler answers"):
-        run_jobs(make(clips, {}), tmp_path / "bench", scheduler="tcp://127.0.0.1:9")
