@@ -26,10 +26,12 @@ if TYPE_CHECKING:
     Section = TypeVar("Section", bound=DataclassInstance)
 
 BASE_KEY = "base"
+# YAML 1.1 takes these for words: it wants a point in the number and a sign in the exponent.
+_NUMBER_WITH_EXPONENT = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+")
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML without two of its traps: the second of two equal keys wins silently, and ``1e-3`` is a word."""
+    """YAML in which a key may stand only once; in the standard loader the last one wins silently."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """See the base class.
@@ -43,11 +45,6 @@ class _Loader(yaml.SafeLoader):
                 raise yaml.constructor.ConstructorError(None, None, f"key '{key.value}' stands twice", key.start_mark)
             seen.add(key.value if isinstance(key, yaml.ScalarNode) else key)
         return super().construct_mapping(node, deep)
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
-)
 
 
 def preset_folder() -> Path:
@@ -192,6 +189,8 @@ def _check(name: str, value: object, hint: type, metadata: Mapping[str, Any]) ->
     Raises:
         ConfigError: another type, not a number, out of range, or none of the choices.
     """
+    if hint is float and isinstance(value, str) and _NUMBER_WITH_EXPONENT.fullmatch(value):
+        value = float(value)
     accepts = (int, float) if hint is float else (hint,)
     if not isinstance(value, accepts) or (isinstance(value, bool) and hint is not bool):
         raise ConfigError(f"{name}: expected {hint.__name__}, found {value!r} ({type(value).__name__})")

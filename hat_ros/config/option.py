@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeVar, get_args
 Level = Literal["basic", "paper", "expert"]
 """Who sets a parameter.
 
-``basic``: every user, to say what there is (backends, device, memory, what is on). ``paper``: whoever repeats or varies
+``basic``: every user, to say what there is (backends, device, memory, what is on). ``paper``: users who repeat or vary
 a published experiment; the value is in the HAT paper, in its authors' reference, or in the paper of a network.
 ``expert``: a tuned constant; change it with a measurement at hand.
 """

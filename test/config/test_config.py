@@ -236,6 +236,26 @@ def test_a_key_that_stands_twice_is_an_error(text, tmp_path):
         load_config(path)
 
 
+def test_a_file_that_cannot_be_read_is_named(tmp_path, monkeypatch):
+    path = tmp_path / "mine.yaml"
+    path.write_text("")
+
+    def denied(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(type(path), "open", denied)
+    with pytest.raises(ConfigError, match=r"cannot read .*mine\.yaml: Permission denied"):
+        load_config(path)
+
+
+@pytest.mark.parametrize("word", ["1e-3", "2026", "on", "0.5"])
+def test_a_word_that_looks_like_a_value_survives_what_a_run_writes_back(word, tmp_path):
+    config = load_config("default", [f"nets.weights_folder='{word}'"])
+    path = tmp_path / "used.yaml"
+    path.write_text(yaml.safe_dump(config_to_dict(config), sort_keys=False))
+    assert load_config(path) == config
+
+
 @pytest.mark.parametrize("text", ["1e-3", "1E-3", "1.e-3", "+1e-03", "0.001", "1.0e-3"])
 def test_a_number_with_an_exponent_is_a_number(text, tmp_path):
     path = tmp_path / "small.yaml"
