@@ -1,14 +1,16 @@
 """The graph on a system with ROS 2 Jazzy installed: ``ros2 launch hat_ros hat.launch.py target:=cad.glb``.
 
 Every node configures and activates itself (``autostart``), so no lifecycle manager is needed. A node that dies is
-started again; the graph goes on in a new epoch.
+started again; with ``live:=true`` the graph then goes on in a new epoch.
+
+Unless the environment says otherwise (``FASTRTPS_DEFAULT_PROFILES_FILE``, ``ROS_AUTOMATIC_DISCOVERY_RANGE``) each node
+takes the Fast DDS profile that comes with the package and discovers other nodes on this machine only.
 """
 
-from launch.actions import DeclareLaunchArgument, GroupAction, SetEnvironmentVariable
+from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
-from launch.substitutions import EnvironmentVariable, LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
-from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
 
@@ -18,7 +20,7 @@ ARGUMENTS = (
     ("config", "default", "preset or YAML file"),
     ("target", "", "CAD model (obj, ply, stl, glb) or target.yaml"),
     ("live", "true", "one frame in flight, the newest wins; false: nothing may be dropped"),
-    ("image", "/image", "topic of the rectified image"),
+    ("image", "/image", "topic of the rectified image; compressed images on <image>/compressed"),
     ("camera_info", "/camera_info", "topic of its calibration"),
     ("overlay", "true", "offer /hat/overlay/compressed"),
 )
@@ -26,11 +28,6 @@ ARGUMENTS = (
 
 def generate_launch_description() -> LaunchDescription:
     arguments = [DeclareLaunchArgument(name, default_value=value, description=doc) for name, value, doc in ARGUMENTS]
-    profile = PathJoinSubstitution([FindPackageShare("hat_ros"), "config", "fastdds.xml"])
-    middleware = SetEnvironmentVariable(
-        "FASTRTPS_DEFAULT_PROFILES_FILE",
-        EnvironmentVariable("FASTRTPS_DEFAULT_PROFILES_FILE", default_value=profile),
-    )
     parameters = [{name: LaunchConfiguration(name) for name in ("config", "target", "live")}]
     image = LaunchConfiguration("image")
     remappings = [
@@ -60,4 +57,4 @@ def generate_launch_description() -> LaunchDescription:
         parameters=parameters,
         condition=IfCondition(LaunchConfiguration("overlay")),
     )
-    return LaunchDescription([*arguments, middleware, GroupAction([*stages, overlay])])
+    return LaunchDescription([*arguments, *stages, overlay])

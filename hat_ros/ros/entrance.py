@@ -29,7 +29,8 @@ class Entrance:
     def __init__(self, live: bool, with_masks: bool) -> None:
         self._live = live
         self._images: deque[tuple[int, Any]] = deque()
-        self._masks: dict[int, Any] | None = {} if with_masks else None
+        self._with_masks = with_masks
+        self._masks: dict[int, Any] = {}
         self._last_number: dict[str, int] = {}
         self.camera: Camera | None = None
         self.dropped_total = 0
@@ -45,7 +46,7 @@ class Entrance:
             topic: where it came from.
             message: Image or CompressedImage.
             number: the publisher's sequence number if the middleware tells it. With a queue of one, DDS overwrites an
-                image that nobody has taken yet; only the gap in the numbers shows it.
+                image that was not taken yet; only the gap in the numbers shows it.
         """
         if number is not None:
             self.dropped_total += max(0, number - self._last_number.get(topic, number - 1) - 1)
@@ -86,9 +87,9 @@ class Entrance:
         stamp_ns, message = self._images[0]
         try:
             admission.check(stamp_ns)
-            if self._masks is not None and stamp_ns not in self._masks:
+            if self._with_masks and stamp_ns not in self._masks:
                 return None
-            mask = None if self._masks is None else decode_mask(self._masks.pop(stamp_ns))
+            mask = decode_mask(self._masks.pop(stamp_ns)) if self._with_masks else None
             frame = Frame(stamp_ns, decode_image(message), self.camera, mask)
         except FrameError as error:
             self._images.popleft()

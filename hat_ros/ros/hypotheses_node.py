@@ -6,35 +6,40 @@ import sys
 from typing import Any
 
 from hat_ros.hypotheses.stage import HypothesisStage
-from hat_ros.io import messages, topics
+from hat_ros.io import topics
 from hat_ros.ros import process
-from hat_ros.ros.stage_node import StageNode
+from hat_ros.ros.joined_frames import JoinedFrame
+from hat_ros.ros.node import HatNode
+from hat_ros.ros.stage_node import StageSession
 
 
-class HypothesesNode(StageNode):
+class HypothesesSession(StageSession):
     """Generates pose candidates at keyframes."""
 
-    NAME = "hypotheses"
-    JOINED = (topics.FRAME,)
-    USES_PRIOR = True
+    def __init__(self, node: HatNode[Any]) -> None:
+        self._stage = HypothesisStage(node.settings.config, node.settings.load_target())
+        super().__init__(node, self._stage, (topics.FRAME,), uses_prior=True)
+        self._wire = node.wire
+        self._scored = node.endpoints.output(topics.HYPOTHESES_SCORED, "selector")
+        self._shown = node.endpoints.output(topics.HYPOTHESES)
 
-    def configure(self) -> None:
-        """Build the stage and its endpoints."""
-        super().configure()
-        self._scored = self.output(topics.HYPOTHESES_SCORED, "selector")
-        self._shown = self.output(topics.HYPOTHESES)
-
-    def create_stage(self) -> HypothesisStage:
-        """The stage object."""
-        return HypothesisStage(self.settings.config, self.target)
-
-    def step(self, stamp_ns: int, frame_id: str, admitted: messages.Admitted, items: dict[str, Any]) -> None:
+    def step(self, joined: JoinedFrame) -> None:
         """Candidates of one frame."""
-        frame, detection = self.frame_of(stamp_ns, items[topics.FRAME])
-        candidates = self.stage.update(frame, detection, self.prior_of(stamp_ns))
-        self._scored.publish(self.wire.candidates(stamp_ns, frame_id, candidates))
+        frame, detection = joined.image()
+        candidates = self._stage.update(frame, detection, joined.prior)
+        self._scored.publish(self._wire.candidates(joined.stamp_ns, joined.frame_id, candidates))
         if len(candidates):
-            self._shown.publish(self.wire.pose_array(stamp_ns, frame_id, candidates.pose_rows))
+            self._shown.publish(self._wire.pose_array(joined.stamp_ns, joined.frame_id, candidates.pose_rows))
+
+
+class HypothesesNode(HatNode[HypothesesSession]):
+    """The node of Stage 2."""
+
+    NAME = "hypotheses"
+
+    def open_session(self) -> HypothesesSession:
+        """Build the stage and its endpoints."""
+        return HypothesesSession(self)
 
 
 def main() -> int:

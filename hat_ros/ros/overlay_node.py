@@ -1,4 +1,4 @@
-"""Debug overlay: CAD outline, axes and state drawn into the image, only while somebody looks.
+"""Debug overlay: CAD outline, axes and state drawn into the image, only while it is watched.
 
 Without a subscriber to ``/hat/overlay/compressed`` not even the images are received.
 """
@@ -8,45 +8,40 @@ from __future__ import annotations
 import sys
 from typing import Any, ClassVar
 
-import cv2
 import numpy as np
 
 from hat_ros.app.overlay import OverlayPainter
 from hat_ros.io import messages, topics
-from hat_ros.ros import base, process, qos
+from hat_ros.io.images import encode_image
+from hat_ros.ros import process, qos
+from hat_ros.ros.node import HatNode
+from hat_ros.ros.session import Session
 from hat_ros.types import Camera
 
 # Images that may wait for their status; more than the frames in flight.
 _FRAMES_KEPT = 32
 
 
-class OverlayNode(base.HatNode):
+class OverlaySession(Session):
     """Draws each estimate into its own image, found by exact stamp."""
 
-    NAME = "overlay"
-    EXTRA_PARAMETERS: ClassVar = {"jpeg_quality": (80, "quality of the published JPEG, 1 to 100")}
-
-    def configure(self) -> None:
-        """Build the painter and its endpoints."""
-        self._painter = OverlayPainter(self.settings.load_target())
+    def __init__(self, node: HatNode[Any]) -> None:
+        self._painter = OverlayPainter(node.settings.load_target())
+        self._quality: int = node.settings.extra["jpeg_quality"]
+        self._wire, self._endpoints = node.wire, node.endpoints
         self._camera: Camera | None = None
         self._frames: dict[int, Any] = {}
-        self._drawn = self.output(topics.OVERLAY)
-        self.input(topics.HAT_CAMERA_INFO, self._on_camera_info, required=False)
-        self.input(topics.STATUS, self._on_status, required=False)
-
-    def cleanup(self) -> None:
-        """Drop the painter."""
-        del self._painter
-        self._frames.clear()
+        self._drawn = node.endpoints.output(topics.OVERLAY)
+        node.endpoints.input(topics.HAT_CAMERA_INFO, self._on_camera_info, required=False)
+        node.endpoints.input(topics.STATUS, self._on_status, required=False)
 
     def every_second(self) -> None:
-        """Receive images only while somebody looks."""
+        """Receive images only while the overlay is watched."""
         watched = self._drawn.get_subscription_count() > 0
-        if watched and not self.has_input(topics.FRAME):
-            self.input(topics.FRAME, self._on_frame, profile=qos.STAGE, required=False)
-        elif not watched and self.has_input(topics.FRAME):
-            self.drop_input(topics.FRAME)
+        if watched and not self._endpoints.has_input(topics.FRAME):
+            self._endpoints.input(topics.FRAME, self._on_frame, profile=qos.STAGE, required=False)
+        elif not watched and self._endpoints.has_input(topics.FRAME):
+            self._endpoints.drop_input(topics.FRAME)
             self._frames.clear()
 
     def _on_camera_info(self, message: Any) -> None:
@@ -65,9 +60,19 @@ class OverlayNode(base.HatNode):
         rgb, _ = messages.frame_from(frame)
         pose_row = estimate.pose_row if estimate.state.has_pose else np.full(7, np.nan)
         image = self._painter.paint(rgb, self._camera, estimate.state, pose_row)
-        quality = [cv2.IMWRITE_JPEG_QUALITY, self.settings.extra["jpeg_quality"]]
-        data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), quality)[1].tobytes()
-        self._drawn.publish(self.wire.compressed(estimate.stamp_ns, frame.header.frame_id, "jpeg", data))
+        data = encode_image(image, "jpeg", self._quality)
+        self._drawn.publish(self._wire.compressed(estimate.stamp_ns, frame.header.frame_id, "jpeg", data))
+
+
+class OverlayNode(HatNode[OverlaySession]):
+    """The node of the overlay."""
+
+    NAME = "overlay"
+    EXTRA_PARAMETERS: ClassVar = {"jpeg_quality": (80, "quality of the published JPEG, 1 to 100")}
+
+    def open_session(self) -> OverlaySession:
+        """Build the painter and its endpoints."""
+        return OverlaySession(self)
 
 
 def main() -> int:

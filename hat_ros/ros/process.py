@@ -7,14 +7,16 @@ import signal
 import sys
 from collections.abc import Sequence
 from types import FrameType
+from typing import Any
 
 import rclpy
+from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
 from hat_ros.errors import HatError
-from hat_ros.ros.base import HatNode
 from hat_ros.ros.environment import keep_large_blocks, leave_cores_to_stages, prepare_environment
+from hat_ros.ros.node import HatNode
 
 
 class StopRequest:
@@ -39,7 +41,7 @@ class StopRequest:
             raise KeyboardInterrupt
 
 
-def spin(executor: SingleThreadedExecutor, nodes: Sequence[HatNode], stop: StopRequest) -> HatError | None:
+def spin(executor: SingleThreadedExecutor, nodes: Sequence[HatNode[Any]], stop: StopRequest) -> HatError | None:
     """Run nodes until all have finished, one has failed, or the process is asked to end; the failure if any."""
     while not stop.made and not all(node.finished for node in nodes):
         failed = next((node for node in nodes if node.failure is not None), None)
@@ -49,26 +51,25 @@ def spin(executor: SingleThreadedExecutor, nodes: Sequence[HatNode], stop: StopR
     return None
 
 
-def close(executor: SingleThreadedExecutor, nodes: Sequence[HatNode]) -> None:
+def close(executor: SingleThreadedExecutor, nodes: Sequence[HatNode[Any]]) -> None:
     """Take nodes apart, also those of a process that was interrupted: what they hold open must be closed."""
     executor.shutdown()
     for node in nodes:
-        node.active = False
         node.release()
         node.destroy_node()
 
 
-def main(node_classes: Sequence[type[HatNode]], args: Sequence[str] | None = None) -> int:
+def main(node_classes: Sequence[type[HatNode[Any]]], args: Sequence[str] | None = None) -> int:
     """Entry point of every node process: 0 done, 1 failed, 2 bad input, with one sentence on stderr."""
     prepare_environment()
     keep_large_blocks()
     leave_cores_to_stages()
     logging.getLogger("hat_ros").setLevel(logging.INFO)
-    context = rclpy.Context()
+    context = Context()
     arguments = list(sys.argv if args is None else args)
     rclpy.init(args=arguments, context=context, signal_handler_options=SignalHandlerOptions.NO)
     executor = SingleThreadedExecutor(context=context)
-    nodes: list[HatNode] = []
+    nodes: list[HatNode[Any]] = []
     stop = StopRequest()
     try:
         stop.install()

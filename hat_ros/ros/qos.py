@@ -1,4 +1,4 @@
-"""QoS profiles of DESIGN section 4, one per topic."""
+"""QoS profiles, one per topic (``docs/topics.md``)."""
 
 from __future__ import annotations
 

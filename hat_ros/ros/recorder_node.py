@@ -1,4 +1,4 @@
-"""Records what the graph says, images excepted, as it came over the wire. Bag time is the exposure stamp."""
+"""Records what the graph sends, images excepted, as it came over the wire. Bag time is the exposure stamp."""
 
 from __future__ import annotations
 
@@ -11,27 +11,23 @@ from hat_ros.errors import ConfigError
 from hat_ros.io import topics
 from hat_ros.io.bag_writer import BagWriter
 from hat_ros.io.rosbag import stamp_of_cdr
-from hat_ros.ros import base, process, qos
+from hat_ros.ros import process, qos
+from hat_ros.ros.node import HatNode
+from hat_ros.ros.session import Session
 
 
-class RecorderNode(base.HatNode):
+class RecorderSession(Session):
     """Writes every topic of :data:`~hat_ros.io.topics.RECORDED` into a bag.
 
     Attributes:
         counts: messages recorded by topic.
         newest_ns: stamp of the last message by topic.
         span_ns: stamps of the first and last admitted frame; nothing lies between (0, -1).
-        writer: the result bag, open until :meth:`release`.
+        writer: the result bag, open until :meth:`close`.
     """
 
-    NAME = "recorder"
-    GOES_ON_LIVE = False
-    EXTRA_PARAMETERS: ClassVar = {"out": ("", "folder of the bag to write")}
-    writer: BagWriter | None = None
-
-    def configure(self) -> None:
-        """Open the bag and subscribe."""
-        out = self.settings.extra["out"]
+    def __init__(self, node: HatNode[Any]) -> None:
+        out = node.settings.extra["out"]
         if not out:
             raise ConfigError("parameter 'out' is empty: give the folder of the bag to write, -p out:=FOLDER")
         self.counts = dict.fromkeys(topics.RECORDED, 0)
@@ -40,23 +36,18 @@ class RecorderNode(base.HatNode):
         self.writer = BagWriter(Path(out))
         for topic in topics.RECORDED:
             profile = qos.RECORDER_LATCH if qos.is_latched(topic) else qos.RECORDER
-            self.input(topic, partial(self._on_message, topic), profile=profile, raw=True)
+            node.endpoints.input(topic, partial(self._on_message, topic), profile=profile, raw=True)
 
-    def cleanup(self) -> None:
-        """Close the bag."""
-        self.release()
-
-    def release(self) -> None:
+    def close(self) -> None:
         """Close the bag; it is complete and readable afterwards."""
-        if self.writer is not None:
-            self.writer.close()
+        self.writer.close()
 
     def values(self) -> dict[str, Any]:
         """Figures for diagnostics."""
-        return dict(self.counts) if self.writer is not None else {}
+        return dict(self.counts)
 
     def _on_message(self, topic: str, data: bytes) -> None:
-        # Diagnostics carry the wall clock; in the bag they stand beside the frame that they were said at.
+        # Diagnostics carry the wall clock; in the bag they stand beside the frame that was newest then.
         clocked = topic == topics.DIAGNOSTICS
         stamp_ns = self.newest_ns[topics.ADMISSION] if clocked else stamp_of_cdr(data, self.writer.path)
         self.writer.write_cdr(topic, topics.TYPES[topic], data, stamp_ns)
@@ -64,6 +55,18 @@ class RecorderNode(base.HatNode):
         if topic == topics.ADMISSION:
             self.span_ns = (self.span_ns[0] if self.counts[topic] > 1 else stamp_ns, stamp_ns)
         self.newest_ns[topic] = max(self.newest_ns[topic], stamp_ns)
+
+
+class RecorderNode(HatNode[RecorderSession]):
+    """The node that writes the result bag."""
+
+    NAME = "recorder"
+    GOES_ON_LIVE = False
+    EXTRA_PARAMETERS: ClassVar = {"out": ("", "folder of the bag to write")}
+
+    def open_session(self) -> RecorderSession:
+        """Open the bag and subscribe."""
+        return RecorderSession(self)
 
 
 def main() -> int:

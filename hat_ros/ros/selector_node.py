@@ -8,34 +8,39 @@ from typing import Any
 from hat_ros.core.selector import SelectorStage
 from hat_ros.io import messages, topics
 from hat_ros.ros import process
-from hat_ros.ros.stage_node import StageNode
+from hat_ros.ros.joined_frames import JoinedFrame
+from hat_ros.ros.node import HatNode
+from hat_ros.ros.stage_node import StageSession
 
 
-class SelectorNode(StageNode):
+class SelectorSession(StageSession):
     """Decodes which candidate is the anchor."""
 
-    NAME = "selector"
-    JOINED = (topics.HYPOTHESES_SCORED, topics.SLAM_STATE)
-    NEEDS_TARGET = False
+    def __init__(self, node: HatNode[Any]) -> None:
+        self._stage = SelectorStage(node.settings.config.selector)
+        super().__init__(node, self._stage, (topics.HYPOTHESES_SCORED, topics.SLAM_STATE))
+        self._wire = node.wire
+        self._selection = node.endpoints.output(topics.SELECTION, "fusion")
+        self._anchor = node.endpoints.output(topics.ANCHOR)
 
-    def configure(self) -> None:
-        """Build the stage and its endpoints."""
-        super().configure()
-        self._selection = self.output(topics.SELECTION, "fusion")
-        self._anchor = self.output(topics.ANCHOR)
-
-    def create_stage(self) -> SelectorStage:
-        """The stage object."""
-        return SelectorStage(self.settings.config.selector)
-
-    def step(self, stamp_ns: int, frame_id: str, admitted: messages.Admitted, items: dict[str, Any]) -> None:
+    def step(self, joined: JoinedFrame) -> None:
         """Selection of one frame."""
-        candidates = messages.candidates_from(items[topics.HYPOTHESES_SCORED])
-        selection = self.stage.update(candidates, messages.motion_from(items[topics.SLAM_STATE]))
-        self._selection.publish(self.wire.selection(stamp_ns, frame_id, selection))
+        candidates = messages.candidates_from(joined.items[topics.HYPOTHESES_SCORED])
+        selection = self._stage.update(candidates, messages.motion_from(joined.items[topics.SLAM_STATE]))
+        self._selection.publish(self._wire.selection(joined.stamp_ns, joined.frame_id, selection))
         if selection.selected >= 0:
             row = selection.candidates.pose_rows[selection.selected]
-            self._anchor.publish(self.wire.pose(stamp_ns, frame_id, row))
+            self._anchor.publish(self._wire.pose(joined.stamp_ns, joined.frame_id, row))
+
+
+class SelectorNode(HatNode[SelectorSession]):
+    """The node of Stage 3."""
+
+    NAME = "selector"
+
+    def open_session(self) -> SelectorSession:
+        """Build the stage and its endpoints."""
+        return SelectorSession(self)
 
 
 def main() -> int:

@@ -5,36 +5,41 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from hat_ros.io import messages, topics
+from hat_ros.io import topics
 from hat_ros.motion.stage import MotionStage
 from hat_ros.ros import process
-from hat_ros.ros.stage_node import StageNode
+from hat_ros.ros.joined_frames import JoinedFrame
+from hat_ros.ros.node import HatNode
+from hat_ros.ros.stage_node import StageSession
 
 
-class SlamNode(StageNode):
+class SlamSession(StageSession):
     """Estimates the camera's motion around the target, up to scale."""
 
-    NAME = "slam"
-    JOINED = (topics.FRAME,)
-    USES_PRIOR = True
+    def __init__(self, node: HatNode[Any]) -> None:
+        self._stage = MotionStage(node.settings.config, node.settings.load_target())
+        super().__init__(node, self._stage, (topics.FRAME,), uses_prior=True)
+        self._wire = node.wire
+        self._state = node.endpoints.output(topics.SLAM_STATE, "selector", "fusion")
+        self._odometry = node.endpoints.output(topics.SLAM_ODOMETRY)
 
-    def configure(self) -> None:
-        """Build the stage and its endpoints."""
-        super().configure()
-        self._state = self.output(topics.SLAM_STATE, "selector", "fusion")
-        self._odometry = self.output(topics.SLAM_ODOMETRY)
-
-    def create_stage(self) -> MotionStage:
-        """The stage object."""
-        return MotionStage(self.settings.config, self.target)
-
-    def step(self, stamp_ns: int, frame_id: str, admitted: messages.Admitted, items: dict[str, Any]) -> None:
+    def step(self, joined: JoinedFrame) -> None:
         """Motion state of one frame."""
-        frame, detection = self.frame_of(stamp_ns, items[topics.FRAME])
-        motion = self.stage.update(frame, detection, self.prior_of(stamp_ns))
-        self._state.publish(self.wire.motion(stamp_ns, frame_id, motion))
+        frame, detection = joined.image()
+        motion = self._stage.update(frame, detection, joined.prior)
+        self._state.publish(self._wire.motion(joined.stamp_ns, joined.frame_id, motion))
         if motion.valid:
-            self._odometry.publish(self.wire.odometry(stamp_ns, frame_id, motion))
+            self._odometry.publish(self._wire.odometry(joined.stamp_ns, joined.frame_id, motion))
+
+
+class SlamNode(HatNode[SlamSession]):
+    """The node of target-relative SLAM."""
+
+    NAME = "slam"
+
+    def open_session(self) -> SlamSession:
+        """Build the stage and its endpoints."""
+        return SlamSession(self)
 
 
 def main() -> int:

@@ -1,4 +1,4 @@
-"""The proofs of DESIGN section 5, on real nodes: same bytes however the graph runs, nothing lost, nothing revised."""
+"""The guarantees of ``docs/architecture.md`` on real nodes: same bytes however the graph runs, nothing revised."""
 
 from __future__ import annotations
 

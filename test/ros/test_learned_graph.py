@@ -20,7 +20,7 @@ from hat_ros.config import load_config
 from hat_ros.io import topics
 from hat_ros.io.result_bag import read_result_bag
 from hat_ros.io.rosbag import TYPESTORE
-from hat_ros.ros.base import ERROR
+from hat_ros.ros.diagnostics import ERROR
 from hat_ros.stages import create_backend
 from hat_ros.target.model import load_target
 

@@ -1,0 +1,135 @@
+"""Which frame a stage may process next: messages joined by exact stamp, calibration and prior there, epochs in order.
+
+Nothing here depends on the order in which messages of different topics arrive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from hat_ros.config import PriorConfig
+from hat_ros.core.sync import ExactJoin
+from hat_ros.errors import RunError
+from hat_ros.io import messages, topics
+from hat_ros.tracking.prior import PriorBuffer
+from hat_ros.types import Camera, Detection, Frame, PosePrior
+
+
+@dataclass(frozen=True)
+class JoinedFrame:
+    """All that a stage needs of one frame.
+
+    Attributes:
+        stamp_ns: exposure stamp.
+        admitted: its record of entry.
+        items: the joined messages by topic.
+        camera: the calibration in force, None for a stage that gets no image.
+        prior: what the fused past tells about the frame, None without one.
+    """
+
+    stamp_ns: int
+    admitted: messages.Admitted
+    items: dict[str, Any]
+    camera: Camera | None
+    prior: PosePrior | None
+
+    @property
+    def frame_id(self) -> str:
+        """``header.frame_id`` of the image."""
+        return self.items[topics.ADMISSION].header.frame_id
+
+    def image(self) -> tuple[Frame, Detection | None]:
+        """The frame and detection of its ``/hat/frame`` message.
+
+        Raises:
+            RunError: the stage does not join ``/hat/frame``.
+        """
+        if self.camera is None:
+            raise RunError(f"{topics.FRAME} is not joined")
+        rgb, detection = messages.frame_from(self.items[topics.FRAME])
+        return Frame(self.stamp_ns, rgb, self.camera), detection
+
+
+class JoinedFrames:
+    """Collects the messages of a stage and hands out complete frames in stamp order.
+
+    Args:
+        joined: topics of which every frame has one message, beside the admission.
+        prior: configuration of priors, None for a stage that uses none.
+        reset: called when a frame opens a new epoch: forget the target's state.
+    """
+
+    def __init__(self, joined: Sequence[str], prior: PriorConfig | None, reset: Callable[[], None]) -> None:
+        self._join = ExactJoin((topics.ADMISSION, *joined))
+        self._priors = None if prior is None else PriorBuffer(prior)
+        self._reset = reset
+        self._with_image = topics.FRAME in joined
+        self._cameras: list[tuple[int, Camera]] = []
+        self._epoch: int | None = None
+
+    def __len__(self) -> int:
+        """Frames of which something is waiting."""
+        return len(self._join)
+
+    @property
+    def late(self) -> int:
+        """Messages that came for frames that had been passed already."""
+        return self._join.late
+
+    def missing(self) -> tuple[int, tuple[str, ...]] | None:
+        """The oldest waiting stamp and the topics it lacks."""
+        return self._join.missing()
+
+    def put(self, topic: str, message: Any) -> None:
+        """Add a message of a joined topic."""
+        self._join.put(topic, messages.stamp_of(message), message)
+
+    def put_camera(self, message: Any) -> None:
+        """Add a calibration, in force from its stamp on."""
+        self._cameras.append((messages.stamp_of(message), messages.camera_from(message)))
+
+    def put_status(self, message: Any) -> None:
+        """Add a fused pose of the past."""
+        if self._priors is not None:
+            self._priors.push(messages.status_from(message).estimate)
+
+    def take(self) -> JoinedFrame | None:
+        """The next frame, None while something that it needs has not arrived.
+
+        Raises:
+            RunError: a message was lost.
+            WireError: the admission is malformed.
+        """
+        head = self._join.peek()
+        if head is None:
+            return None
+        stamp_ns, items = head
+        admitted = messages.admitted_from(items[topics.ADMISSION])
+        if admitted.epoch != self._epoch:
+            self._enter(admitted.epoch)
+            self._join.drop_before(stamp_ns)  # given up in the old epoch, never to be completed
+        if self._priors is not None:
+            self._priors.admit(stamp_ns)
+            if not self._priors.ready(stamp_ns):
+                return None
+        camera = self._camera_at(stamp_ns)
+        if camera is None and self._with_image:
+            return None
+        self._join.take()
+        prior = None if self._priors is None else self._priors.before(stamp_ns)
+        return JoinedFrame(stamp_ns, admitted, items, camera, prior)
+
+    def _enter(self, epoch: int) -> None:
+        if self._epoch is not None:
+            self._reset()
+            if self._priors is not None:
+                self._priors.reset()
+        self._epoch = epoch
+
+    def _camera_at(self, stamp_ns: int) -> Camera | None:
+        """The newest calibration that is not newer than the stamp."""
+        while len(self._cameras) > 1 and self._cameras[1][0] <= stamp_ns:
+            self._cameras.pop(0)
+        return self._cameras[0][1] if self._cameras and self._cameras[0][0] <= stamp_ns else None

@@ -1,0 +1,147 @@
+"""The entrance of the graph: admits frames by credit, numbers them, adds the mask."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+from rclpy.duration import Duration
+from std_srvs.srv import Trigger
+
+from hat_ros.errors import FrameError
+from hat_ros.io import messages, topics
+from hat_ros.ros import qos
+from hat_ros.ros.diagnostics import OK, STEADY, WARN
+from hat_ros.ros.entrance import Entrance
+from hat_ros.ros.flights import Flights
+from hat_ros.ros.node import HatNode
+from hat_ros.ros.pacing import ExtraDelay, StepTimer
+from hat_ros.ros.session import Session
+from hat_ros.segmentation.stage import SegmentationStage
+from hat_ros.tracking.prior import PriorBuffer
+from hat_ros.types import Frame
+
+_STAGES = {"hypotheses", "slam", "selector", "fusion"}
+
+
+class SegmentationSession(Session):
+    """Admits a frame while it has a credit (W in replay, 1 live) and the whole graph is matched."""
+
+    def __init__(self, node: HatNode[Any]) -> None:
+        config, live = node.settings.config, node.settings.live
+        annotated = config.segmentation.backend == "annotated"
+        self._node, self._wire, self._diagnostics = node, node.wire, node.diagnostics
+        self._stage = SegmentationStage(config, node.settings.load_target())
+        self._priors = PriorBuffer(config.prior)
+        self._entrance = Entrance(live, annotated)
+        self._flights = Flights(config.graph, live)
+        self._epoch = 0
+        self._camera_sent = self._is_open = False
+        self._ready_nodes: set[str] = set()
+        self._delay = ExtraDelay(node.NAME, config.graph.debug_stage_delay_ms)
+        self._step_timer = StepTimer()
+        self._subscribe(annotated, live)
+        readers = ("fusion",) if config.refinement.enabled else ()
+        self._camera_info = node.endpoints.output(topics.HAT_CAMERA_INFO, "hypotheses", "slam", *readers)
+        self._admission = node.endpoints.output(topics.ADMISSION, *sorted(_STAGES))
+        self._frame = node.endpoints.output(topics.FRAME, "hypotheses", "slam", *readers)
+        self._service = node.create_service(Trigger, topics.RESET, self._on_reset)
+        self._timer = node.create_timer(0.1, partial(node.guarded, self._check_time), clock=STEADY)
+
+    def _subscribe(self, annotated: bool, live: bool) -> None:
+        subscribe = self._node.endpoints.input
+        for topic in (topics.IMAGE, topics.IMAGE_COMPRESSED):
+            subscribe(topic, partial(self._on_image, topic), required=False, with_info=True)
+        subscribe(topics.CAMERA_INFO, self._on_camera_info, required=False)
+        if annotated:
+            subscribe(topics.DETECTION_MASK, self._on_mask, profile=qos.IN_REPLAY, required=not live)
+        subscribe(topics.STATUS, self._on_status)
+        subscribe(topics.READY, self._on_ready, profile=qos.LATCH_READER, required=False)
+
+    def close(self) -> None:
+        """Drop the service and the timer."""
+        self._node.destroy_service(self._service)
+        self._node.destroy_timer(self._timer)
+
+    def values(self) -> dict[str, Any]:
+        """Figures for diagnostics."""
+        in_flight = len(self._flights.admission.in_flight)
+        counts = {
+            "admitted": self._flights.admitted,
+            "dropped": self._entrance.dropped_total,
+            "in_flight": in_flight,
+        }
+        return counts | self._step_timer.values()
+
+    def _on_image(self, topic: str, message: Any, info: dict[str, Any]) -> None:
+        self._entrance.add_image(topic, message, info["publication_sequence_number"])
+        self._pump()
+
+    def _on_mask(self, message: Any) -> None:
+        self._entrance.add_mask(message)
+        self._pump()
+
+    def _on_camera_info(self, message: Any) -> None:
+        if self._entrance.set_camera(messages.camera_from(message)):
+            self._camera_sent = False
+            self._new_epoch()
+        self._pump()
+
+    def _on_status(self, message: Any) -> None:
+        estimate = messages.status_from(message).estimate
+        self._priors.push(estimate)
+        if self._flights.leave(estimate.stamp_ns):
+            self._diagnostics.report(OK, "running")
+        self._pump()
+
+    def _on_ready(self, message: Any) -> None:
+        self._ready_nodes.add(message.frame_id)
+        self._pump()
+
+    def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self._new_epoch()
+        response.success, response.message = True, f"epoch {self._epoch} begins with the next frame"
+        return response
+
+    def _pump(self) -> None:
+        if not self._is_open:
+            self._is_open = self._ready_nodes >= _STAGES and not self._node.endpoints.unmatched()
+        while self._is_open and self._flights.admission.has_credit:
+            try:
+                found = self._entrance.next_frame(self._flights.admission)
+            except FrameError as error:
+                self._diagnostics.report(WARN, str(error))
+                continue
+            if found is None:
+                return
+            self._admit(*found)
+
+    def _admit(self, frame: Frame, frame_id: str) -> None:
+        stamp_ns = frame.stamp_ns
+        if not self._camera_sent:
+            self._camera_sent = True
+            self._camera_info.publish(self._wire.camera_info(stamp_ns, frame_id, frame.camera))
+            self._camera_info.wait_for_all_acked(Duration(seconds=5))  # it must be there before its first image
+        seq = self._flights.enter(stamp_ns)
+        admitted = messages.Admitted(seq, self._entrance.dropped_total, self._epoch)
+        self._admission.publish(self._wire.admission(stamp_ns, frame_id, admitted))
+        self._delay.wait()
+        with self._step_timer.frame():
+            detection = self._stage.update(frame, self._priors.before(stamp_ns))
+            self._frame.publish(self._wire.frame(stamp_ns, frame_id, frame.rgb, detection))
+
+    def _check_time(self) -> None:
+        """A stage that does not answer: a replay ends, a live graph goes on in a new epoch."""
+        overdue = self._flights.overdue()
+        if overdue is not None:
+            self._new_epoch()
+            self._is_open = False
+            self._node.fail(overdue)
+        elif self._is_open and len(self._entrance) and self._entrance.camera is None:
+            self._diagnostics.report(WARN, f"images arrive, but no calibration on {topics.CAMERA_INFO}")
+        self._pump()
+
+    def _new_epoch(self) -> None:
+        self._epoch += 1
+        self._stage.reset()
+        self._priors.reset()

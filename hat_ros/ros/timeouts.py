@@ -1,0 +1,34 @@
+"""How long a graph may take to answer, and what is said when it does not."""
+
+from __future__ import annotations
+
+import time
+
+from hat_ros.config import GraphConfig
+from hat_ros.errors import StageTimeoutError
+
+# Ends the sentence of a stage timeout, so that whatever started the node can tell it from other failures.
+HANGS = "a stage does not answer"
+
+
+def answer_limit(config: GraphConfig, first: bool) -> tuple[float, str]:
+    """Seconds that a frame may take through the graph, and the option to raise; the first one also compiles code."""
+    if first and config.startup_timeout_s > config.stage_timeout_s:
+        return config.startup_timeout_s, "graph.startup_timeout_s"
+    return config.stage_timeout_s, "graph.stage_timeout_s"
+
+
+def check_progress(since_s: float, limit_s: float, what: str, option: str) -> None:
+    """Raise when too much time has passed.
+
+    Args:
+        since_s: monotonic time of the last progress.
+        limit_s: seconds that may pass without any.
+        what: what did not happen.
+        option: the option that raises the limit.
+
+    Raises:
+        StageTimeoutError: more time has passed.
+    """
+    if time.monotonic() - since_s > limit_s:
+        raise StageTimeoutError(f"{what} within {limit_s:g} s (raise {option} if it is only slow)")
