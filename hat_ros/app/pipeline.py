@@ -6,35 +6,20 @@ bytes. Clocks are read here, never inside a stage.
 
 from __future__ import annotations
 
-import resource
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Protocol
 
-import numpy as np
-
 from hat_ros.app.scheduler import StageScheduler
+from hat_ros.app.timing import STAGE_NAMES, LapClock, resident_mib
 from hat_ros.core.sync import Admission
 from hat_ros.errors import FrameError
 from hat_ros.tracker import StageWrapper, Step
 from hat_ros.types import Estimate, Frame
-
-STAGE_NAMES = ("segmentation", "hypotheses", "motion", "selector", "fusion")
-MEASURED = (
-    "latency_ms",
-    "period_ms",
-    "cpu_ms",
-    "decode_ms",
-    *(f"{name}_ms" for name in STAGE_NAMES),
-    "rss_mib",
-)
-# First frames left out of throughput and latency: compiled code is loaded and caches are filled there.
-WARMUP_FRAMES = 10
 
 
 @dataclass(frozen=True)
@@ -60,7 +45,7 @@ class Processed:
     cpu_ms: float = float("nan")
 
     def measured(self) -> tuple[float, ...]:
-        """The values of :data:`MEASURED`, in order."""
+        """The values of :data:`~hat_ros.app.timing.MEASURED`, in order."""
         return (
             self.latency_ms,
             self.period_ms,
@@ -115,7 +100,7 @@ class Pipeline:
         An error of the recording is raised after the answers to what was read before it.
         """
         in_flight: deque[Future[Processed]] = deque()
-        clock = _Clock()
+        clock = LapClock()
         with closing(_ReadAhead(frames)) as attempts, ThreadPoolExecutor(self._credits, "frame") as threads:
             try:
                 admitted = self._admitted(attempts)
@@ -133,7 +118,8 @@ class Pipeline:
                 while in_flight:
                     done = in_flight.popleft().result()
                     self._admission.answered(done.step.estimate.stamp_ns)
-                    answer = replace(done, **clock.lap())
+                    period_ms, cpu_ms = clock.lap()
+                    answer = replace(done, period_ms=period_ms, cpu_ms=cpu_ms)
                     fill()  # now: what the caller does with the answer takes its time
                     yield answer
                 if failure is not None:
@@ -195,57 +181,3 @@ class _ReadAhead:
         start = time.perf_counter()
         frame = next(self._frames, None)
         return frame, 1e3 * (time.perf_counter() - start)
-
-
-class _Clock:
-    """Wall and processor time between answers."""
-
-    def __init__(self) -> None:
-        self._last = time.perf_counter(), time.process_time()
-
-    def lap(self) -> dict[str, float]:
-        now = time.perf_counter(), time.process_time()
-        wall_s, cpu_s = (b - a for a, b in zip(self._last, now, strict=True))
-        self._last = now
-        return {"period_ms": 1e3 * wall_s, "cpu_ms": 1e3 * cpu_s}
-
-
-def resident_mib() -> float:
-    """Resident memory of this process in MiB; NaN where the system does not say."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    except (OSError, ValueError, IndexError):
-        return float("nan")
-    return pages * resource.getpagesize() / 2**20
-
-
-def memory_summary(rows: list[tuple[float, ...]]) -> dict[str, float]:
-    """How much resident memory grew from the first to the last quarter of a run: medians over rows of MEASURED."""
-    rss_mib = np.array([row[MEASURED.index("rss_mib")] for row in rows])
-    quarter = len(rss_mib) // 4
-    if quarter == 0:
-        return {"memory_growth_mib": float("nan")}
-    # The first quarter begins after warm-up: caches fill there by design.
-    first = rss_mib[min(WARMUP_FRAMES, quarter) :][:quarter]
-    return {"memory_growth_mib": float(np.median(rss_mib[-quarter:]) - np.median(first))}
-
-
-def latency_summary(rows: list[tuple[float, ...]], finish_s: float = 0.0) -> dict[str, float]:
-    """Throughput, latency percentiles and mean time per stage over rows of :data:`MEASURED`, after warm-up.
-
-    Throughput counts everything that is done while the recording runs: decoding, the method, writing of results; and
-    ``finish_s``, what a method that is not causal computes after the last frame.
-    """
-    table = np.array(rows[WARMUP_FRAMES:] or rows, dtype=np.float64).reshape(-1, len(MEASURED))
-    if not len(table):
-        return {"fps": float("nan"), "latency_ms_p50": float("nan"), "latency_ms_p99": float("nan")}
-    column = dict(zip(MEASURED, table.T, strict=True))
-    return {
-        "fps": float(len(table) / (1e-3 * column["period_ms"].sum() + finish_s)),
-        "latency_ms_p50": float(np.percentile(column["latency_ms"], 50)),
-        "latency_ms_p99": float(np.percentile(column["latency_ms"], 99)),
-        "latency_ms_max": float(column["latency_ms"].max()),
-        "cpu_ms_mean": float(column["cpu_ms"].mean()),
-        "decode_ms_mean": float(column["decode_ms"].mean()),
-        **{f"{name}_ms_mean": float(column[f"{name}_ms"].mean()) for name in STAGE_NAMES},
-    }

@@ -24,7 +24,7 @@ _START = "start"
 
 
 class Closed(Exception):
-    """An earlier frame failed, or nobody waits for the answer any more."""
+    """An earlier frame failed, or the answer is not waited for any more."""
 
 
 class StageScheduler:

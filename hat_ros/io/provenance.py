@@ -23,7 +23,7 @@ _PACKAGE = Path(hat_ros.__file__).resolve().parent
 def code_version() -> str:
     """Commit of the checkout, with ``+changes`` when files differ from it; the package version when installed."""
     root = _PACKAGE.parent
-    if not (root / ".git").exists():  # installed, perhaps within somebody else's checkout
+    if not (root / ".git").exists():  # installed, perhaps within another project's checkout
         return _version("hat_ros") or "unknown"
     try:
         commit = _git(root, "rev-parse", "HEAD")

@@ -27,6 +27,7 @@ from typing import Any, TextIO
 import numpy as np
 import yaml
 
+from hat_ros.array_types import Float
 from hat_ros.config import HatConfig, config_to_dict
 from hat_ros.errors import RunError, UsageError
 from hat_ros.types import Estimate
@@ -152,7 +153,7 @@ class LiveTables:
         self._stack.close()
 
 
-def tum_line(stamp_ns: int, pose_row: np.ndarray) -> str:
+def tum_line(stamp_ns: int, pose_row: Float) -> str:
     """One line of a TUM trajectory: seconds to the nanosecond, then the pose in full precision."""
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
     return f"{seconds}.{nanoseconds:09d} " + " ".join(repr(float(value)) for value in pose_row) + "\n"

@@ -1,4 +1,4 @@
-"""The in-process pipeline: admission, masks, timing; independent of any backend."""
+"""The in-process pipeline: admission, order, errors of reading; independent of any backend."""
 
 import threading
 
@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 from scripted import CAMERA, ScriptedMethod, frame, stamp
 
-from hat_ros.app.pipeline import (
-    MEASURED,
-    WARMUP_FRAMES,
-    Pipeline,
-    latency_summary,
-    memory_summary,
-    resident_mib,
-)
+from hat_ros.app.pipeline import Pipeline
 from hat_ros.bench.source import open_source
 from hat_ros.bench.synth.models import write_model
 from hat_ros.errors import BagError, FrameError, UsageError
@@ -74,36 +67,6 @@ def test_frames_are_read_by_one_thread_and_an_error_of_reading_ends_the_run():
     abandoned.close()
     assert len(threads) == 1, "closed by the thread that read it"
     assert threading.get_ident() not in threads
-
-
-def row(**values):
-    return tuple(values.get(name, 0.0) for name in MEASURED)
-
-
-def test_speed_is_by_the_clock_on_the_wall_and_leaves_out_warm_up():
-    slow = row(latency_ms=1000.0, period_ms=1000.0)
-    overlapping = row(latency_ms=30.0, period_ms=10.0, motion_ms=3.0)  # three frames in flight
-    summary = latency_summary([slow] * WARMUP_FRAMES + [overlapping] * 50)
-    assert summary["fps"] == pytest.approx(100.0)
-    assert summary["latency_ms_p50"] == summary["latency_ms_p99"] == pytest.approx(30.0)
-    assert summary["motion_ms_mean"] == pytest.approx(3.0)
-
-
-def test_what_hindsight_computes_after_the_last_frame_counts():
-    row = tuple({"period_ms": 100.0}.get(name, 1.0) for name in MEASURED)
-    assert latency_summary([row] * (WARMUP_FRAMES + 10))["fps"] == pytest.approx(10.0)
-    assert latency_summary([row] * (WARMUP_FRAMES + 10), finish_s=1.0)["fps"] == pytest.approx(5.0)
-
-
-def test_memory_growth_compares_quarters():
-    rows = [row(rss_mib=100.0 + (i >= 60) * 5.0) for i in range(80)]
-    assert memory_summary(rows)["memory_growth_mib"] == pytest.approx(5.0)
-    assert np.isnan(memory_summary(rows[:3])["memory_growth_mib"])
-    assert 1.0 < resident_mib() < 1e5
-
-
-def test_latency_of_nothing_is_nan():
-    assert np.isnan(latency_summary([])["fps"])
 
 
 @pytest.fixture

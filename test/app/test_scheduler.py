@@ -19,7 +19,7 @@ from hat_ros.types import Frame
 
 
 class Stage:
-    """Notes what it is called with, and that nobody else is inside."""
+    """Notes what it is called with, and that no other frame is inside."""
 
     def __init__(self, delays):
         self.delays, self.seen, self.inside = delays, [], threading.Lock()
@@ -96,7 +96,7 @@ def test_frames_before_one_that_fails_are_answered_and_its_error_is_the_one_seen
     assert method.stages["motion"].seen == list(range(7))
 
 
-def test_who_stops_listening_stops_the_threads():
+def test_closing_the_run_stops_the_threads():
     before = threading.active_count()
     run = Pipeline(ThreeStages().behind, 4).run(frame(i) for i in range(1000))
     next(run)
@@ -104,7 +104,7 @@ def test_who_stops_listening_stops_the_threads():
     assert threading.active_count() == before
 
 
-def test_a_closed_scheduler_lets_nobody_wait():
+def test_a_closed_scheduler_lets_no_frame_wait():
     scheduler = StageScheduler()
     scheduler.close(3)
     with scheduler.frame(0):

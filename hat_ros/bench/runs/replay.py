@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hat_ros.app.pipeline import WARMUP_FRAMES
+from hat_ros.app.timing import WARMUP_FRAMES
 from hat_ros.bench.evaluation.result_folder import complete_folder
 from hat_ros.bench.runs.folder import RunOptions, Watcher, result_folder
 from hat_ros.bench.source import SourceSpec

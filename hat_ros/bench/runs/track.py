@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from hat_ros.app.pipeline import MEASURED, Pipeline, latency_summary, memory_summary
+from hat_ros.app.pipeline import Pipeline
+from hat_ros.app.timing import MEASURED, latency_summary, memory_summary
 from hat_ros.bench.evaluation.metrics import mask_summary
 from hat_ros.bench.evaluation.result_folder import complete_folder
 from hat_ros.bench.evaluation.silhouettes import Silhouettes

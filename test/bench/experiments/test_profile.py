@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from hat_ros.app.pipeline import STAGE_NAMES
+from hat_ros.app.timing import STAGE_NAMES
 from hat_ros.bench.experiments.profile import profile
 from hat_ros.bench.source import open_source
 from hat_ros.bench.synth.clips import ClipSpec
