@@ -110,11 +110,11 @@ def topic_tables() -> str:
     """One Markdown table of topics per group."""
     parts = []
     for group in (INPUTS, OUTPUTS, STAGES, PEOPLE, RUN):
-        rows = ["| Topic | Type | From, to | How often | QoS | What |", "|---|---|---|---|---|---|"]
+        rows = ["| Topic, type | From, to | What | How often | QoS |", "|---|---|---|---|---|"]
         for topic, kind in topics.TYPES.items():
             about, route, often, what = ABOUT[topic]
             if about == group:
-                rows.append(f"| `{topic}` | `{kind}` | {route} | {often} | {qos_text(topic)} | {what} |")
+                rows.append(f"| `{topic}`<br>`{kind}` | {route} | {what} | {often} | {qos_text(topic)} |")
         parts.append(f"## {group}\n\n" + "\n".join(rows))
     return "\n\n".join(parts)
 
@@ -122,7 +122,7 @@ def topic_tables() -> str:
 def qos_text(topic: str) -> str:
     """Quality of service of a topic in words; inputs differ between a camera and a replay."""
     if ABOUT[topic][0] == INPUTS:
-        return f"{LIVE_INPUT_QOS} (live); {STAGE_QOS} (replay)"
+        return f"live: {LIVE_INPUT_QOS}; replay: {STAGE_QOS}"
     return QOS.get(topic, STAGE_QOS)
 
 

@@ -32,7 +32,7 @@ def read(path: Path) -> str:
 def test_every_topic_is_in_the_reference():
     page = GENERATE.fill(read(ROOT / "docs" / "topics.md"))
     for topic, kind in topics.TYPES.items():
-        assert f"| `{topic}` | `{kind}` |" in page
+        assert f"| `{topic}`<br>`{kind}` |" in page
     assert set(GENERATE.ABOUT) == set(topics.TYPES)
     assert "generated:" not in page
 
@@ -53,7 +53,7 @@ def test_quality_of_service_is_that_of_the_nodes():
     for topic in topics.TYPES:
         if GENERATE.ABOUT[topic][0] == GENERATE.INPUTS:
             both = (described(qos.profile_of(topic, live=True)), described(qos.profile_of(topic)))
-            assert GENERATE.qos_text(topic) == f"{both[0]} (live); {both[1]} (replay)"
+            assert GENERATE.qos_text(topic) == f"live: {both[0]}; replay: {both[1]}"
         else:
             assert GENERATE.qos_text(topic) == described(qos.profile_of(topic))
 
