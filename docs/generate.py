@@ -122,7 +122,7 @@ def topic_tables() -> str:
 def qos_text(topic: str) -> str:
     """Quality of service of a topic in words; inputs differ between a camera and a replay."""
     if ABOUT[topic][0] == INPUTS:
-        return f"live: {LIVE_INPUT_QOS}; replay: {STAGE_QOS}"
+        return f"live: {LIVE_INPUT_QOS};<br>replay: {STAGE_QOS}"
     return QOS.get(topic, STAGE_QOS)
 
 

@@ -2,7 +2,7 @@
 
     python examples/gnc_node.py
 
-The status is a PointCloud2 with one row of named float64 columns, published after the pose of the same stamp.
+The status is a PointCloud2 with one row of named float64 columns, and the stamp of its pose.
 """
 
 from __future__ import annotations
@@ -31,19 +31,29 @@ class GncNode(Node):
     def __init__(self) -> None:
         super().__init__("gnc")
         self._poses: dict[tuple[int, int], PoseWithCovarianceStamped] = {}
+        self._states: dict[tuple[int, int], int] = {}
         self.create_subscription(PoseWithCovarianceStamped, "/target_pose_with_covariance", self._on_pose, 10)
         self.create_subscription(PointCloud2, "/hat/status", self._on_status, 10)
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        self._poses[message.header.stamp.sec, message.header.stamp.nanosec] = message
+        key = (message.header.stamp.sec, message.header.stamp.nanosec)
+        self._poses[key] = message
+        self._join(key)
 
     def _on_status(self, message: PointCloud2) -> None:
-        stamp = message.header.stamp
-        state = int(first_row(message)["state"])
-        pose = self._poses.pop((stamp.sec, stamp.nanosec), None)
-        # Poses of older frames that lack a status are of no use any more.
-        self._poses = {key: value for key, value in self._poses.items() if key > (stamp.sec, stamp.nanosec)}
-        time = f"{stamp.sec}.{stamp.nanosec // 1_000_000:03d}"
+        key = (message.header.stamp.sec, message.header.stamp.nanosec)
+        self._states[key] = int(first_row(message)["state"])
+        self._join(key)
+
+    def _join(self, key: tuple[int, int]) -> None:
+        """Act once a frame's state is known, and its pose if it has one: two topics may arrive in either order."""
+        state, pose = self._states.get(key), self._poses.get(key)
+        if state is None or (pose is None and state in (TRACKING, COASTING)):
+            return
+        for waiting in (self._states, self._poses):
+            for old in [other for other in waiting if other <= key]:
+                del waiting[old]
+        time = f"{key[0]}.{key[1] // 1_000_000:03d}"
         if pose is None:
             print(f"{time} {NAMES[state]}: no pose, hold", flush=True)
         elif state == TRACKING:
