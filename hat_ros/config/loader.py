@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     Section = TypeVar("Section", bound=DataclassInstance)
 
-BASE_KEY = "base"
 # YAML 1.1 takes these for words: it wants a point in the number and a sign in the exponent.
 _NUMBER_WITH_EXPONENT = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+")
 
@@ -131,12 +130,12 @@ def _read(name_or_file: str, readers: tuple[str, ...]) -> dict[str, Any]:
         return {}
     if not isinstance(data, dict):
         raise ConfigError(f"{path}: the top level must be a mapping of sections, found {type(data).__name__}")
-    if BASE_KEY not in data:
+    if "base" not in data:
         return data
-    base = data.pop(BASE_KEY)
+    base = data.pop("base")
     if base not in preset_names() or base in (*readers, name_or_file):
         others = ", ".join(name for name in preset_names() if name not in (*readers, name_or_file))
-        raise ConfigError(f"{path}: {BASE_KEY} must be one of the presets {others}; found {base!r}")
+        raise ConfigError(f"{path}: base must be one of the presets {others}; found {base!r}")
     return _merged(_read(base, (*readers, name_or_file)), data)
 
 
