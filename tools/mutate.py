@@ -59,7 +59,7 @@ STAGES = {
         ("segmentation.mask2former.",),
     ),
     "hypotheses": Stage(
-        ("hypotheses/*.py", "target/view_bank.py"),
+        ("hypotheses/*.py", "target/view_bank.py", "target/polar.py"),
         ("megapose.py", "gigapose.py", "picopose.py", "picopose_templates.py"),
         ("hypotheses.", "keyframes."),
         ("hypotheses.megapose.", "hypotheses.picopose."),
@@ -188,7 +188,7 @@ def _in_configuration(stage: Stage) -> Iterator[Constant]:
         if not name.startswith(stage.options) or (stage.without_options and name.startswith(stage.without_options)):
             continue
         number = _plain(value)
-        if number is not None and why_not_tuned(name) is None:
+        if number is not None and option.metadata["level"] == "expert" and why_not_tuned(name) is None:
             yield Constant(name, number, low=option.metadata.get("low"), high=option.metadata.get("high"))
 
 

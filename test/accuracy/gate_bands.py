@@ -12,7 +12,7 @@ from gate_clips import FRAMES, Recording
 
 from hat_ros.app.pipeline import Pipeline
 from hat_ros.bench.evaluation.metrics import UNTRUE_DEG, pose_errors
-from hat_ros.bench.methods import create_method
+from hat_ros.bench.methods.framewise import Hat
 from hat_ros.config import load_config
 from hat_ros.types import TrackState
 
@@ -49,7 +49,7 @@ class Outcome:
 
 def measure(recording: Recording) -> Outcome:
     """Run the default preset over a recording, two frames in flight, and score it."""
-    pipeline = Pipeline(partial(create_method, "hat", load_config("default"), recording.target), credits=2)
+    pipeline = Pipeline(partial(Hat, load_config("default"), recording.target), credits=2)
     estimates = [done.step.estimate for done in pipeline.run(recording.frames)]
     T_est = np.array([e.T_cam_target if e.state.has_pose else np.full((4, 4), np.nan) for e in estimates])
     errors = pose_errors(T_est, recording.T_true)
