@@ -40,7 +40,7 @@ build() {
 
 check_places() {
   # As launch's FindPackageShare does.
-  local share lib
+  local share lib file name
   share=$(python -c "from ament_index_python.packages import get_package_share_directory as share; print(share('hat_ros'))")
   lib=$share/../../lib/hat_ros
   [ "$(realpath "$share")" = "$(realpath "$work/ws/install/hat_ros/share/hat_ros")" ]
