@@ -37,7 +37,8 @@ def so3_exp(rotvec: Float) -> Float:
     """Rotation matrix of a rotation vector (eq. 132): (..., 3) -> (..., 3, 3)."""
     rotvec = np.asarray(rotvec, dtype=np.float64)
     if rotvec.ndim == 1:
-        return np.array(rotation_entries(*rotvec.tolist(), _SMALL_ANGLE_SQ)).reshape(3, 3)
+        x, y, z = rotvec.tolist()
+        return np.array(rotation_entries(x, y, z, _SMALL_ANGLE_SQ), dtype=np.float64).reshape(3, 3)
     angle_sq = np.sum(rotvec * rotvec, axis=-1)
     small = angle_sq < _SMALL_ANGLE_SQ
     safe = np.where(small, 1.0, angle_sq)
@@ -70,11 +71,7 @@ def so3_right_jacobian_inverse(rotvec: Float) -> Float:
     rotvec = np.asarray(rotvec, dtype=np.float64)
     k = hat(rotvec)
     if rotvec.ndim == 1:
-        angle_sq = float(rotvec @ rotvec)
-        half = 0.5 * math.sqrt(angle_sq)
-        small = angle_sq < _SMALL_ANGLE_SQ_JACOBIAN
-        factor = 1.0 / 12.0 + angle_sq / 720.0 if small else (1.0 - half / math.tan(half)) / angle_sq
-        return _EYE + 0.5 * k + factor * (k @ k)
+        return _EYE + 0.5 * k + _curvature(float(rotvec @ rotvec)) * (k @ k)
     angle_sq = np.sum(rotvec * rotvec, axis=-1)
     small = angle_sq < _SMALL_ANGLE_SQ_JACOBIAN
     safe = np.where(small, 1.0, angle_sq)
@@ -159,7 +156,7 @@ def matrix_from_row(row: Float) -> Float:
 def is_rigid(T: Float, tolerance: float = 1e-4) -> Bool:
     """Whether each matrix is finite, has a proper rotation and the last row 0 0 0 1: (..., 4, 4) -> (...) bool."""
     T = np.asarray(T, dtype=np.float64)
-    finite = np.isfinite(T).all(axis=(-1, -2))
+    finite = np.asarray(np.isfinite(T).all(axis=(-1, -2)))
     safe = np.where(finite[..., None, None], T, np.eye(4))
     R = safe[..., :3, :3]
     orthogonal = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(-1, -2)) < tolerance
@@ -169,6 +166,14 @@ def is_rigid(T: Float, tolerance: float = 1e-4) -> Bool:
 
 # One pose at a time is what a stage handles per frame; there the batched functions above would spend all their time on
 # numpy's overhead. Same formulas on plain floats, agreeing with the batched ones to the last bit or two.
+
+
+def _curvature(angle_sq: float) -> float:
+    """Factor of the squared skew matrix in J_r^-1."""
+    if angle_sq < _SMALL_ANGLE_SQ_JACOBIAN:
+        return 1.0 / 12.0 + angle_sq / 720.0
+    half = 0.5 * math.sqrt(angle_sq)
+    return (1.0 - half / math.tan(half)) / angle_sq
 
 
 def rotation_entries(x: float, y: float, z: float, small_angle_sq: float) -> tuple[float, ...]:

@@ -39,7 +39,8 @@ def silhouette_in_box(rgb: UInt8, box_mask: Bool) -> Bool | None:
     size = (max(8, round(crop.shape[1] * scale)), max(8, round(crop.shape[0] * scale)))
     inside = cv2.resize(box_mask[y0:y1, x0:x1].astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
     labels = np.where(inside > 0, cv2.GC_PR_FGD, cv2.GC_BGD).astype(np.uint8)
-    cut = graph_cut(cv2.resize(crop, size, interpolation=cv2.INTER_AREA), labels, ColorModels(), _ITERATIONS)
+    reduced = np.asarray(cv2.resize(crop, size, interpolation=cv2.INTER_AREA), np.uint8)
+    cut = graph_cut(reduced, labels, ColorModels(), _ITERATIONS)
     cut = None if cut is None else tidy(cut, None)
     if cut is None:
         return None

@@ -57,7 +57,7 @@ class GigaPoseHypotheses:
         crops, Ms = [], []
         for T in poses:
             view = renderer.render(T, TEMPLATE_K, TEMPLATE_SIZE)
-            mask = view.any(axis=2)  # a black surface still has a normal
+            mask = np.asarray(view.any(axis=2))  # a black surface still has a normal
             Ms.append(letterbox(mask))
             crops.append(cut(view[..., :3], mask, Ms[-1]))
         features, ist = [], []

@@ -153,7 +153,8 @@ def _best_matches(
         order = np.argpartition(-best, n_sorted - 1)[:n_sorted]
         order = order[np.lexsort((order, -best[order]))]
         placement, view, angle = np.unravel_index(peaks[order], score.shape)
-        T = _poses(bank, placements, placement, view, angle * (2.0 * np.pi / bank.n_angles), camera, center_m)
+        angle_rad = angle.astype(np.float64) * (2.0 * np.pi / bank.n_angles)
+        T = _poses(bank, placements, placement, view, angle_rad, camera, center_m)
         keep = distinct(T[:, :3, :3], n_best, np.radians(separation_deg))
         if len(keep) == n_best:
             break
@@ -203,8 +204,8 @@ def _is_inside(placement: Placement, shape: tuple[int, ...]) -> bool:
     return bool(low.min() >= 0 and high[0] <= shape[1] - 1 and high[1] <= shape[0] - 1)
 
 
-def rehearse(bank: ViewBank) -> None:
-    """Match nothing with a bank, so that everything is compiled before the first frame comes."""
+def warm_up(bank: ViewBank) -> None:
+    """Match an empty image with a bank, so that everything is compiled before the first frame."""
     _peaks(_correlate(bank, np.zeros((1, bank.n_angles, N_RINGS), np.float32)))
 
 

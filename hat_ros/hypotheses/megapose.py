@@ -99,7 +99,8 @@ class MegaPoseHypotheses:
         image, K = runtime.image(frame.rgb), runtime.tensor(frame.camera.K)
         box = padded_box(detection.box_xyxy, self._padding, frame.camera)
         T = mp.pose_from_box(self._grid, self._hull, K, runtime.tensor(box))
-        boxes = mp.crop_boxes(mp.orthonormalise(T), K.expand(len(T), 3, 3), self._megapose.points.crop, image.shape[1:])
+        size = (image.shape[1], image.shape[2])
+        boxes = mp.crop_boxes(mp.orthonormalise(T), K.expand(len(T), 3, 3), self._megapose.points.crop, size)
         logits = self._megapose.score_prepared(image, boxes, self._coarse_views(frame.camera))
         best = logits.topk(min(self._n_candidates, len(logits))).indices
         return self._megapose.candidates(image, K, T[best], detection)

@@ -167,7 +167,7 @@ def solve_pose(
         return None
     if not found or inliers is None:
         return None
-    T = lie.transform(lie.so3_exp(rotvec[:, 0]), t[:, 0])
+    T = lie.transform(lie.so3_exp(np.asarray(rotvec, np.float64)[:, 0]), np.asarray(t, np.float64)[:, 0])
     return (T, len(inliers) / len(points)) if np.isfinite(T).all() else None
 
 

@@ -54,7 +54,8 @@ class SquareCrop:
     def resize(self, image: UInt8) -> Float32:
         """(H, W, 3) RGB -> (3, 224, 224) BGR in [0, 1], bilinear."""
         cut = np.ascontiguousarray(self.cut(image)[..., ::-1], np.float32) / 255
-        return cv2.resize(cut, (CROP_PX, CROP_PX), interpolation=cv2.INTER_LINEAR).transpose(2, 0, 1)
+        resized = np.asarray(cv2.resize(cut, (CROP_PX, CROP_PX), interpolation=cv2.INTER_LINEAR), np.float32)
+        return resized.transpose(2, 0, 1)
 
     def resize_mask(self, mask: Bool) -> Float32:
         """(H, W) -> (224, 224) of 0 and 1, nearest."""

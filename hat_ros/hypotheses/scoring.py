@@ -1,4 +1,4 @@
-"""How much the image speaks for a pose: evidence per candidate, and its log-likelihood.
+"""Evidence of an image for a pose, and its log-likelihood.
 
 Overlap of silhouette and mask comes first. It is expressed as the mean distance between the two outlines in pixels, so
 that it means the same for a target of 60 and of 600 pixels.
@@ -67,7 +67,7 @@ class Scorer:
         self.field = field
         self.light_field = LightField(frame.rgb, field.mask)
         self._render_px = render_px
-        self.luma = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+        self.luma = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
         self.dark_around = self._is_dark_around()
 
     def _is_dark_around(self) -> bool:
@@ -77,11 +77,11 @@ class Scorer:
         x1, y1 = (self.field.origin_px + (width, height)).astype(int)
         around = self.luma[y0:y1, x0:x1]
         outside = ~self.field.mask[y0:y1, x0:x1]
-        dark = np.count_nonzero(outside & (around < VISIBLE_LEVEL))
-        return dark >= _DARK_SHARE * max(np.count_nonzero(outside), 1)
+        n_dark, n_outside = int(np.count_nonzero(outside & (around < VISIBLE_LEVEL))), int(np.count_nonzero(outside))
+        return n_dark >= _DARK_SHARE * max(n_outside, 1)
 
     def light(self) -> Float32 | None:
-        """(H, W) what shines in and around the mask, without the sky's level; None when that is next to nothing."""
+        """(H, W) light in and around the mask above the sky's level; None when there is hardly any."""
         around = cv2.dilate(self.field.mask.astype(np.uint8), np.ones((_HALO_PX, _HALO_PX), np.uint8))
         outside = self.luma[around == 0]
         level = float(np.median(outside)) if outside.size else 0.0
@@ -144,8 +144,8 @@ def log_score(e: Evidence) -> float:
     The weights are those of a multinomial logistic regression of the right basin on the evidence, over some eight
     hundred images of ten spacecraft whose masks were right, found by thresholds, two pixels too large, or lacked parts;
     on a spacecraft left out of the fit the right basin wins in 97 % of the images (by overlap alone: 84 %). So
-    ``selector.score_scale`` 1 takes them at their word. Logarithms, because masks fail in patches: a large patch says
-    little more than a small one.
+    ``selector.score_scale`` 1 leaves them as they are. Logarithms, because masks fail in patches: a large patch is
+    hardly more evidence than a small one.
     """
     shape = shape_score(e.excess_px, e.missing_px, e.hidden_px)
     return shape - 5.0 * e.mask_rms_px + 3.3 * e.edge_share + 4.6 * e.mask_share

@@ -1,4 +1,4 @@
-"""Stage 2 as the tracker and the node see it: one backend, asked at keyframes only, its answer checked."""
+"""Stage 2 as the tracker and the node see it: one backend, called at keyframes only, its candidates checked."""
 
 from __future__ import annotations
 

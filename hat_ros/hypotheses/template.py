@@ -8,8 +8,8 @@
 4. The evidence of each is turned into a log-likelihood (``scoring``): how well its outline and the mask's agree, and
    how well it explains what is bright and what is dark (``refinement.sunlight``).
 
-A pose predicted from the past is one more start, however little it is trusted: where the image tells little, a track
-that did not compete would lose to chance.
+A pose predicted from the past is one more start, whatever its health: where the image is ambiguous, a track without a
+candidate of its own would lose to chance.
 
 Unless the best candidate is where a healthy track expects it, more is tried. A mask that no view fits well is matched
 as part of a silhouette, unless light is going to tell and there is a prior. Before a black sky the mask holds what is
@@ -41,7 +41,7 @@ from hat_ros.hypotheses.matching import (
     match_light,
     match_shape,
     partial_placements,
-    rehearse,
+    warm_up,
     whole_placement,
 )
 from hat_ros.hypotheses.scoring import Scorer, light_score, log_score, shape_score
@@ -66,7 +66,7 @@ _MIN_SCALE_PX = 1.5
 _REFINED_SHARE = 1 / 3
 _FAR_SHARE = 0.1
 # Without a prior there is nothing to fall back on: so many times as many coarse matches are looked at (six times found
-# no more right poses than three on clips with doubtful masks, and more wrong ones).
+# no more right poses than three on clips with poor masks, and more wrong ones).
 _UNAIDED_FACTOR = 3
 # Before the mask's bias is known, outlines this close agree.
 _SELECTION_TOLERANCE_PX = 1.0
@@ -145,7 +145,7 @@ class TemplateHypotheses:
         self._body_bank = load_or_build(target, renderer, options.n_views, options.n_angles, thin_parts=False)
         self._near_symmetries = load_or_find_symmetries(target)
         for bank in (self._lit_bank, self._bank, self._body_bank):  # a bank just built is not typed like one from disk
-            rehearse(bank)
+            warm_up(bank)
 
     def generate(self, frame: Frame, detection: Detection, prior: PosePrior | None) -> Candidates:
         """Up to K refined and scored poses, best first; zero rows when nothing fits."""
@@ -156,7 +156,7 @@ class TemplateHypotheses:
         scorer = Scorer(self._viewer, frame, field, self._options.render_px)
         if not scorer.dark_around:
             space = look_into_space(frame.rgb, self._sky_border_share)
-            if space is not None and space.rgb is not frame.rgb:  # what is not the target's light says nothing about it
+            if space is not None and space.rgb is not frame.rgb:  # light of other origin is no evidence
                 frame = replace(frame, rgb=space.rgb)
                 scorer = Scorer(self._viewer, frame, field, self._options.render_px)
         starts = []
@@ -282,7 +282,7 @@ class TemplateHypotheses:
         return [ordered[i] for i in distinct(R, n_best, np.radians(self._options.separation_deg))]
 
     def _counterparts(self, scored: list[tuple[Float, float]]) -> list[Float]:
-        """Poses that look like the best candidate and have not been tried: nobody else may have been near them."""
+        """Poses that look like the best candidate and have not been tried: no other start may have been near them."""
         known = np.stack([T[:3, :3] for T, _ in scored])
         _, *others = self._alike(scored)
         return [T for T in others if lie.angle_between(known, T[:3, :3]).min() > np.radians(_TRIED_DEG)]
@@ -297,7 +297,8 @@ class TemplateHypotheses:
     ) -> list[tuple[Float, float]]:
         """The same, the best candidate and those that look like it compared once more by their details."""
         basin = np.stack([T[:3, :3] for T in self._alike(scored)])
-        rest, best = [], {}
+        rest: list[tuple[Float, float]] = []
+        best: dict[int, tuple[Float, float]] = {}
         for T, score in scored:
             apart_rad = lie.angle_between(basin, T[:3, :3])
             nearest = int(np.argmin(apart_rad))
@@ -311,7 +312,7 @@ class TemplateHypotheses:
         return rest + again if len(again) == len(starts) else scored
 
     def _confirms(self, T_cam_target: Float, prior: PosePrior | None) -> bool:
-        """Whether a candidate that leads is the healthy prior's: then nothing else is looked for."""
+        """Whether a candidate lies in the basin of a healthy prior: then the search ends."""
         if prior is None or not prior.healthy:
             return False
         apart_rad = lie.angle_between(T_cam_target[:3, :3], prior.T_cam_target[:3, :3])
@@ -323,8 +324,8 @@ class TemplateHypotheses:
             return False
         leader, best = max(scored, key=lambda pair: pair[1])
         apart_rad = lie.angle_between(np.stack([T[:3, :3] for T, _ in scored]), leader[:3, :3])
-        rivals = np.array([score for _, score in scored])[apart_rad > np.radians(self._options.separation_deg)]
-        return bool(best - rivals.max(initial=-np.inf) >= _CLEAR_LEAD) or self._confirms(leader, prior)
+        competing = np.array([score for _, score in scored])[apart_rad > np.radians(self._options.separation_deg)]
+        return bool(best - competing.max(initial=-np.inf) >= _CLEAR_LEAD) or self._confirms(leader, prior)
 
     def _finish(
         self, starts: list[Aligned], frame: Frame, scorer: Scorer, fitter: PoseFitter | None = None
@@ -340,7 +341,9 @@ class TemplateHypotheses:
                 start.T_cam_target, frame.camera, frame.rgb, scorer.field, (_LAST,), to_sun_cam=start.to_sun_cam
             )
             view = None if fit is None else scorer.view(fit, start.to_sun_cam)
-            evidence = None if fit is None or view is None else scorer.evidence(fit, view)
+            if fit is None or view is None:
+                continue
+            evidence = scorer.evidence(fit, view)
             if evidence is not None:
                 poses.append(fit.T_cam_target)
                 views.append(view)
@@ -358,7 +361,6 @@ class TemplateHypotheses:
 def _outline_distance_px(T_cam_target: Float, points_m: Float, camera: Camera, field: MaskField) -> float:
     """Mean distance of contour points (N, 3) from a mask's outline, pixels; far ones count as not quite so far."""
     uv = camera.project(points_m @ T_cam_target[:3, :3].T + T_cam_target[:3, 3]) - field.origin_px
-    distance = cv2.remap(
-        field.distance, uv[None].astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
+    u, v = (np.ascontiguousarray(uv[None, :, axis], np.float32) for axis in range(2))
+    distance = cv2.remap(field.distance, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return float(np.minimum(np.abs(distance), _FAR_SHARE * field.size_px).mean())

@@ -1,4 +1,4 @@
-"""Refines each fused pose on the current image, and says how far to trust it."""
+"""Refines each fused pose on the current image, and estimates its covariance and its support in the image."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hat_ros.config import RefinementConfig
 from hat_ros.geometry import lie
 from hat_ros.refinement.covariance import outline_floor, outline_misfit_px, pose_covariance
 from hat_ros.refinement.mask_field import MaskField, Overlap
-from hat_ros.refinement.pose_fitter import WITH_MASK, WITHOUT_MASK, Fit, PoseFitter
+from hat_ros.refinement.pose_fitter import WITH_MASK, WITHOUT_MASK, Fit, PoseFitter, Schedule
 from hat_ros.refinement.sunlight import LightField, SunMatcher
 from hat_ros.refinement.view import TargetViewer, View, contour_lines
 from hat_ros.target.model import Target
@@ -28,7 +28,7 @@ _SHADOW_SHARE = 0.05
 # sun is looked for as well where the mask shows so much beside the silhouette (with what is black on black, as a share
 # of the silhouette), and not little of what it misses is black.
 _SMALL_SHARE, _BLACK_SHARE = 0.03, 0.2
-# A sunlit contour is a stub, which agrees with anything, where silhouette and mask disagree by so many pixels along it;
+# A sunlit contour is a stub, which fits anything, where silhouette and mask disagree by so many pixels along it;
 # where they disagree by so many times that before it is refined, refining does not help.
 _STUB_MISFIT_PX = 5.0
 _HOPELESS_FACTOR = 2.0
@@ -48,13 +48,13 @@ class _Image:
 
     def __init__(self, frame: Frame, detection: Detection | None) -> None:
         self.frame, self.detection = frame, detection
-        self.luma = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
+        self.luma = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
         self.field = MaskField(detection.mask) if detection is not None and detection.silhouette else None
 
     @cached_property
-    def light(self) -> LightField:
-        """What shaded models are compared with; there must be a mask."""
-        return LightField(self.frame.rgb, self.field.mask)
+    def light(self) -> LightField | None:
+        """What shaded models are compared with, None without a mask."""
+        return None if self.field is None else LightField(self.frame.rgb, self.field.mask)
 
     def areas(self, view: View | None) -> Overlap | None:
         """Agreement of mask and view, None without one of them."""
@@ -70,12 +70,14 @@ class _Task:
         prior: what is known of the rotation.
         start: (4, 4) pose to start from.
         view: what the target looks like there, None when it is out of view.
+        areas: agreement of mask and view, None without one of them.
     """
 
     image: _Image
     prior: RotationPrior
     start: Float
     view: View | None
+    areas: Overlap | None
 
 
 class ContourRefiner:
@@ -93,7 +95,7 @@ class ContourRefiner:
         self._viewer = TargetViewer(target)
         self._sun = SunMatcher(self._viewer)
         self._fitter = PoseFitter(self._viewer, config.render_px, config.max_points)
-        self._image: _Image | None = None  # the newest: several poses are refined on each where the track is in doubt
+        self._image: _Image | None = None  # the newest: several poses are refined on it where the track is ambiguous
 
     def refine(
         self,
@@ -115,10 +117,9 @@ class ContourRefiner:
             measured, or the refinement would leave the basin.
         """
         task = self._task(self._look(frame, detection), T_cam_target, prior)
-        at_start = task.image.areas(task.view)
-        in_shadow = at_start is not None and _lies_in_shadow(at_start)
+        in_shadow = task.areas is not None and _lies_in_shadow(task.areas)
         if in_shadow:
-            sunlit = self._sunlit(task, at_start)
+            sunlit = self._sunlit(task)
             if sunlit is not None:
                 return sunlit
         fit = self._fine(task) or self._fit_all(task, task.view)
@@ -129,7 +130,7 @@ class ContourRefiner:
         if in_shadow or refined is None or areas is None or not _looks_small(areas):
             return refined
         # A pose too small and far hides its own shadow.
-        sunlit = self._sunlit(task, at_start)
+        sunlit = self._sunlit(task)
         return sunlit if sunlit is not None and sunlit.quality > refined.quality else refined
 
     def reset(self) -> None:
@@ -151,16 +152,18 @@ class ContourRefiner:
             start = self._fitter.centred(T_cam_target, camera, image.field, image.luma, view)
             if start is not T_cam_target:
                 view = self._viewer.view(start, camera, self._config.render_px)
-        return _Task(image, prior, start, view)
+        return _Task(image, prior, start, view, image.areas(view))
 
-    def _sunlit(self, task: _Task, at_start: Overlap) -> Refined | None:
+    def _sunlit(self, task: _Task) -> Refined | None:
         """Refined by the contour of what the sun shines on; None where that is hardly anything, or no sun is found."""
+        if task.view is None or task.areas is None or task.image.light is None:
+            return None
         sunlight = self._sun.match(task.view, task.image.light)
         if sunlight is None:
             return None
         lit = self._viewer.in_sunlight(task.view, sunlight.to_sun_cam)
         outline_px = contour_lines(lit, self._config.max_points).length_px
-        if outline_misfit_px(at_start, outline_px) > _HOPELESS_FACTOR * _STUB_MISFIT_PX:
+        if outline_misfit_px(task.areas, outline_px) > _HOPELESS_FACTOR * _STUB_MISFIT_PX:
             return None
         fit = self._fit_all(task, lit, sunlight.to_sun_cam)
         if fit is None:
@@ -191,14 +194,15 @@ class ContourRefiner:
         if field is None or view is None:
             return None
         fit = self._fitter.fit(task.start, frame.camera, frame.rgb, field, WITH_MASK[-1:], task.prior, view=view)
-        if fit.support < _ENOUGH_SUPPORT:
+        if fit is None or fit.support < _ENOUGH_SUPPORT:
             return None
         # The view is the start's.
         return fit if np.hypot(*fit.shift_px) + fit.twist_px <= _SMALL_MOVE_PX else None
 
     def _fit_all(self, task: _Task, view: View | None, to_sun_cam: Float | None = None) -> Fit | None:
         """All rounds, from the widest to the finest, with a view of the start, all or its sunlit part."""
-        frame, field, rounds = task.image.frame, task.image.field, WITHOUT_MASK
+        frame, field = task.image.frame, task.image.field
+        rounds: tuple[Schedule, ...] = WITHOUT_MASK
         if field is not None:
             factor = float(np.clip(field.size_px / _USUAL_SIZE_PX, *_SCALE_LIMITS))
             rounds = (WITH_MASK[0].scaled(factor), *WITH_MASK[1:])

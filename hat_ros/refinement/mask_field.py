@@ -1,4 +1,4 @@
-"""What the detection says, ready to be compared with a view: the mask as a signed distance, and areas of agreement."""
+"""The mask as a signed distance, and the areas in which a rendered view agrees with it."""
 
 from __future__ import annotations
 
@@ -44,17 +44,17 @@ class MaskField:
         self.origin_px = np.array([x0, y0], dtype=np.float64)
         inside = pixels[max(y0, 0) : y1, max(x0, 0) : x1]
         beyond = (max(-y0, 0), max(y1 - mask.shape[0], 0), max(-x0, 0), max(x1 - mask.shape[1], 0))
-        crop = cv2.copyMakeBorder(inside, *beyond, cv2.BORDER_REPLICATE)
+        crop = np.asarray(cv2.copyMakeBorder(inside, *beyond, cv2.BORDER_REPLICATE), np.uint8)
         self._beyond = beyond
-        distance = cv2.distanceTransform(1 - crop, cv2.DIST_L2, 5)
+        distance = _distance_to_zero(1 - crop)
         # Inwards where the mask is; with two pixels around it nothing outside can be nearer.
         left, top, width, height = cv2.boundingRect(crop)
         box = np.s_[max(0, top - 2) : top + height + 2, max(0, left - 2) : left + width + 2]
-        distance[box] -= cv2.distanceTransform(crop[box], cv2.DIST_L2, 5) if not crop.all() else np.float32(1e3 + 0.5)
+        distance[box] -= _distance_to_zero(crop[box]) if not crop.all() else np.float32(1e3 + 0.5)
         # A boundary lies half a pixel from the centres on either side of it.
         distance += crop
         distance -= np.float32(0.5)
-        self.distance = cv2.GaussianBlur(distance, (0, 0), 1.0)
+        self.distance = np.asarray(cv2.GaussianBlur(distance, (0, 0), 1.0), np.float32)
 
     @cached_property
     def centroid_px(self) -> Float:
@@ -92,6 +92,11 @@ class MaskField:
     def _area_deeper_than(self, depth_px: float) -> float:
         centers = (np.arange(_DEPTH_BINS) + 0.5) * _DEPTH_BIN_PX
         return float(self._depth_counts @ np.clip(centers - depth_px, 0.0, 1.0))
+
+
+def _distance_to_zero(pixels: UInt8) -> Float32:
+    """Distance (H, W) of each pixel to the nearest one that is zero."""
+    return np.asarray(cv2.distanceTransform(pixels, cv2.DIST_L2, 5), np.float32)
 
 
 @njit(cache=True, nogil=True)

@@ -20,7 +20,7 @@ _SAME_CONTOUR_PX = 1.0
 # A contour point agrees with the image when its edge or the mask's boundary lies this close, pixels.
 _AGREE_PX = 2.5
 # How much an edge must count by itself to say that the target is there. With a mask that is known, and a step too small
-# for an edge, as on black before black, does not speak against a pose.
+# for an edge, as on black before black, is no evidence against a pose.
 _MIN_EDGE = 0.1
 # Damping while only the mask's outline is known and the start is far off.
 _PULL_DAMPING = 1e-3
@@ -113,7 +113,7 @@ class PoseFitter:
         self.viewer = viewer
         self._render_px = render_px
         self._max_points = max_points
-        self._rehearse()
+        self._warm_up()
 
     def fit(
         self,
@@ -255,8 +255,8 @@ class PoseFitter:
         twist_px = radius_px * (angle + abs(after[2] / before[2] - 1.0))
         return camera.project(after) - camera.project(before), float(twist_px)
 
-    def _rehearse(self) -> None:
-        """Fit the target to a made-up mask, so that everything is compiled before the first frame comes."""
+    def _warm_up(self) -> None:
+        """Fit the target to a made-up mask, so that everything is compiled before the first frame."""
         side = 2 * _CENTRING_PX
         camera, T = self.viewer.made_up(side)
         image = np.zeros((side, side, 3), np.uint8)

@@ -64,8 +64,9 @@ class LightField:
     def __init__(self, image: UInt8, mask: Bool) -> None:
         self.image = image
         self.mask = mask
-        self.box = cv2.boundingRect(mask.view(np.uint8))
-        width_px = max(1, round(_SMOOTH_SHARE * max(self.box[2:])))
+        left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
+        self.box = (left, top, width, height)
+        width_px = max(1, round(_SMOOTH_SHARE * max(width, height)))
         self.smooth = cv2.blur(image, (width_px, width_px))
 
 
@@ -92,7 +93,7 @@ class SunMatcher:
         suns = even_directions(_N_SUNS)
         self._suns = suns[suns[:, 2] < _MAX_BEHIND].astype(np.float32)
         self._encoded = brightness(np.linspace(0.0, 1.0, 257, dtype=np.float32))
-        self._rehearse()
+        self._warm_up()
 
     def match(self, view: View, field: LightField) -> Sunlight | None:
         """The sunlight in which a view of the target looks most like the image, None when it is out of the image."""
@@ -134,8 +135,8 @@ class SunMatcher:
         beside = _light_beside(field.image, field.mask, field.box, view.mask, view.origin_px, view.scale)
         return _Scene(seen, observed, beside / (step * spacing_px) ** 2)
 
-    def _rehearse(self) -> None:
-        """Light up a made-up view of the target, so that everything is compiled before the first frame comes."""
+    def _warm_up(self) -> None:
+        """Fit sunlight to a made-up view of the target, so that everything is compiled before the first frame."""
         side = 4 * _SIDE_POINTS
         camera, T = self._viewer.made_up(side)
         view = self._viewer.view(T, camera, 2 * _SIDE_POINTS)

@@ -89,10 +89,10 @@ class TargetViewer:
         self.target = target
         self._caster = ray_caster(target)
         self._normals = target.face_normals.astype(np.float32)
-        self._shadow_start_m = np.float32(_SHADOW_START * target.bounding_radius_m)
+        self._shadow_start_m = _SHADOW_START * target.bounding_radius_m
 
     def made_up(self, side_px: int) -> tuple[Camera, Float]:
-        """Square camera and a (4, 4) pose at which it sees the whole target, to rehearse with."""
+        """Square camera and a (4, 4) pose at which it sees the whole target, for the warm-up."""
         camera = Camera(np.array([[side_px, 0, side_px / 2], [0, side_px, side_px / 2], [0, 0, 1.0]]), side_px, side_px)
         center_m = np.array([0.0, 0.0, 4.0 * self.target.bounding_radius_m])
         return camera, lie.transform(np.eye(3), center_m - self.target.center_m)
@@ -147,10 +147,10 @@ class TargetViewer:
 
     def surface(self, directions: Float, origin_m: Float) -> Surfels:
         """What rays (N, 3) from one point see, in the target frame."""
-        directions = directions.astype(np.float32)
-        origins = np.empty_like(directions)
+        rays = directions.astype(np.float32)
+        origins = np.empty_like(rays)
         origins[:] = origin_m
-        return self._surfels((origins, directions), self._caster.trace(origins, directions))
+        return self._surfels((origins, rays), self._caster.trace(origins, rays))
 
     def surfels(self, view: View, rays: NDArray[np.intp]) -> Surfels:
         """What some of a view's grid of rays see: (N,) which, row by row of every second pixel of the crop."""

@@ -35,7 +35,7 @@ def contour_table(depth_m: Float32, silhouette: Bool, K_crop: Float, max_points:
         share of contour length, pixels); free distance in crop pixels inwards and outwards, at most 24. Contour on
         the crop's own border is left out.
     """
-    blurred = cv2.GaussianBlur(silhouette.astype(np.float32), (0, 0), _SMOOTHING_PX)
+    blurred = np.asarray(cv2.GaussianBlur(silhouette.astype(np.float32), (0, 0), _SMOOTHING_PX), np.float32)
     return _contour_table(np.ascontiguousarray(depth_m), silhouette, blurred, K_crop, max_points)
 
 

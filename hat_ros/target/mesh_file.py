@@ -1,4 +1,4 @@
-"""Mesh files from others: what they declare is checked before a parser allocates anything (DESIGN section 7)."""
+"""Mesh files from others: what they declare is checked before a parser allocates anything."""
 
 from __future__ import annotations
 

@@ -168,8 +168,8 @@ def target_from_scene(scene: trimesh.Scene, name: str, unit_scale: float = 1.0) 
     """
     if not (np.isfinite(unit_scale) and unit_scale > 0):
         raise MeshError(f"CAD model {name}: unit_scale must be a positive number, found {unit_scale}")
-    parts = [_part(scene, node, name) for node in sorted(scene.graph.nodes_geometry)]
-    parts = [part for part in parts if part is not None]
+    found = (_part(scene, node, name) for node in sorted(scene.graph.nodes_geometry))
+    parts = [part for part in found if part is not None]
     if not parts:
         raise MeshError(f"CAD model {name}: it holds no triangles; export the surface as a triangle mesh")
     corners = np.concatenate([part.corners_m for part in parts]) * unit_scale
@@ -218,16 +218,16 @@ def _part(scene: trimesh.Scene, node: str, name: str) -> _Part | None:
     corner_rgb, texture, rgb = None, None, np.full((n_faces, 3), _GREY, np.uint8)
     roughness, metallic = 0.6, 0.0
     visual = mesh.visual
-    if visual.kind == "texture":
+    if isinstance(visual, trimesh.visual.TextureVisuals):
         rgb[:], texture, roughness, metallic = _material(visual.material)
         uv = None if visual.uv is None else np.asarray(visual.uv, dtype=np.float32)
         if uv is None or len(uv) != len(mesh.vertices) or not np.isfinite(uv).all():
             texture = None
         elif texture is not None:
             corner_uv = uv[faces]
-    elif visual.kind == "vertex":
+    elif isinstance(visual, trimesh.visual.ColorVisuals) and visual.kind == "vertex":
         corner_rgb = np.asarray(visual.vertex_colors, dtype=np.uint8)[:, :3][faces]
-    elif visual.kind == "face":
+    elif isinstance(visual, trimesh.visual.ColorVisuals) and visual.kind == "face":
         rgb = np.asarray(visual.face_colors, dtype=np.uint8)[:, :3].copy()
     normal = _corner_normals(mesh, vertices[faces], faces, T[:3, :3])
     return _Part(vertices[faces], corner_uv, corner_rgb, normal, rgb, texture, roughness, metallic)

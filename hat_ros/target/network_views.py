@@ -9,7 +9,7 @@ cuts distant targets off, is not imitated.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numba import njit
@@ -19,6 +19,8 @@ from hat_ros.array_types import Float, Float32, Int, Int32, UInt8
 from hat_ros.spans import span
 from hat_ros.target.model import Target
 from hat_ros.target.raster import edge_functions, nearest_faces
+
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 # Rotated-grid sample positions within a pixel, the usual 4x pattern of rasterisers.
 _SAMPLES = np.array([[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]])
@@ -55,7 +57,7 @@ class NetworkViewRenderer:
         T, K = np.asarray(T_cam_target, dtype=np.float64), np.ascontiguousarray(K, dtype=np.float64)
         R = np.ascontiguousarray(T[:3, :3])
         corners = self._corners_m @ R.T + T[:3, 3]
-        edges = edge_functions(corners, np.linalg.inv(K))
+        edges = edge_functions(corners, np.asarray(np.linalg.inv(K), np.float64))
         face = nearest_faces(corners, K, edges, _SAMPLES, width, height)
         return _shade(face, edges, _SAMPLES, R, self._look)
 
@@ -80,20 +82,24 @@ class _Look(NamedTuple):
 
 def _look_of(target: Target) -> _Look:
     surface = target.surface
-    sizes = [texture.shape[0] * texture.shape[1] for texture in surface.textures]
-    first = np.concatenate([[0], np.cumsum(sizes)])[:-1] if sizes else []
-    shapes = [(start, *texture.shape[:2]) for start, texture in zip(first, surface.textures, strict=True)]
-    texels = [texture.reshape(-1, 3) for texture in surface.textures]
-    arrays = (
-        target.face_rgb,
-        _NO_COLORS if surface.corner_rgb is None else surface.corner_rgb,
-        surface.corner_normal,
-        surface.corner_uv,
-        surface.texture_id,
+    textures = surface.textures
+    first = np.cumsum([0] + [texture.shape[0] * texture.shape[1] for texture in textures])
+    shapes = [(start, *texture.shape[:2]) for start, texture in zip(first, textures, strict=False)]
+    texels = [texture.reshape(-1, 3) for texture in textures]
+    return _Look(
+        _owned(target.face_rgb),
+        _owned(_NO_COLORS if surface.corner_rgb is None else surface.corner_rgb),
+        _owned(surface.corner_normal),
+        _owned(surface.corner_uv),
+        _owned(surface.texture_id),
         np.concatenate(texels) if texels else np.zeros((0, 3), np.uint8),
         np.array(shapes, dtype=np.int64).reshape(-1, 3),
     )
-    return _Look(*(np.array(array, order="C") for array in arrays))
+
+
+def _owned(array: NDArray[Scalar]) -> NDArray[Scalar]:
+    """A writable copy, row by row: one type for compiled code, wherever the array came from."""
+    return np.array(array, order="C")
 
 
 @njit(cache=True, nogil=True)

@@ -50,7 +50,8 @@ class PolarSampler:
             left, top = max(self._left - step_px, 0), max(self._top - step_px, 0)
             part = self._image[top : self._top + self._height + step_px, left : self._left + self._width + step_px]
             if step_px > 1:
-                part = cv2.blur(part, (step_px, step_px), borderType=cv2.BORDER_REPLICATE)
+                blurred = cv2.blur(part, (step_px, step_px), borderType=cv2.BORDER_REPLICATE)
+                part = np.asarray(blurred, np.float32)
             self._averaged[step_px] = part, left, top
         return self._averaged[step_px]
 
@@ -67,8 +68,8 @@ def border_grid(shape: tuple[int, ...], center_px: Float, gyration_px: float, n_
 
 def _polar(gyration_px: float, n_angles: int) -> tuple[Float, Float]:
     """Radii (rings,) of a polar grid, pixels, and its angles (n_angles, 1), radians."""
-    radius_px = (np.arange(N_RINGS) + 0.5) * (gyration_px * MAX_RADIUS / N_RINGS)
-    return radius_px, (np.arange(n_angles) * (2.0 * np.pi / n_angles))[:, None]
+    radius_px = (np.arange(N_RINGS, dtype=np.float64) + 0.5) * (gyration_px * MAX_RADIUS / N_RINGS)
+    return radius_px, (np.arange(n_angles, dtype=np.float64) * (2.0 * np.pi / n_angles))[:, None]
 
 
 def ring_weights() -> Float32:

@@ -1,4 +1,4 @@
-"""Ray casting against a target's triangles: one scene per geometry and process, whoever asks for it.
+"""Ray casting against a target's triangles, with one scene per geometry and process.
 
 Intel Embree casts the rays where the ``embreex`` wheel exists. Elsewhere (aarch64 Linux) compiled code of our own does,
 which finds the same hits up to rounding and is several times slower.
