@@ -54,7 +54,7 @@ def cached_arrays(kind: str, key: str, build: Callable[[], Mapping[str, NDArray]
 
 
 def _digest(array: NDArray) -> str:
-    return hashlib.blake2b(memoryview(array).cast("B") if array.size else b"", digest_size=16).hexdigest()
+    return hashlib.blake2b(array.data.cast("B") if array.size else b"", digest_size=16).hexdigest()
 
 
 def _read(entry: Path) -> Arrays | None:

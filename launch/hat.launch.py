@@ -9,16 +9,16 @@ takes the Fast DDS profile that comes with the package and discovers other nodes
 
 from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
+from launch.launch_description import LaunchDescription
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from launch import LaunchDescription
-
 STAGES = ("segmentation", "hypotheses", "slam", "selector", "fusion")
 
+# Name, default (None: must be given), description.
 ARGUMENTS = (
     ("config", "default", "preset or YAML file"),
-    ("target", "", "CAD model (obj, ply, stl, glb) or target.yaml"),
+    ("target", None, "CAD model (obj, ply, stl, glb) or target.yaml"),
     ("live", "true", "one frame in flight, the newest wins; false: nothing may be dropped"),
     ("image", "/image", "topic of the rectified image; compressed images on <image>/compressed"),
     ("camera_info", "/camera_info", "topic of its calibration"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -34,6 +35,12 @@ _REQUIRED = {
     "PIL": "pillow",
 }
 _OPTIONAL = {"torch": "nets", "transformers": "nets", "safetensors": "nets", "pyrender": "gl"}
+# Packages whose releases have broken this one before -> oldest and newest version that the tests run with.
+TESTED = {
+    "numba": ("0.59.0", "0.68.1"),
+    "embreex": ("2.17.7.post5", "4.4.0.post1"),
+    "opencv-python-headless": ("4.6.0.66", "4.13.0.92"),
+}
 
 
 @dataclass(frozen=True)
@@ -42,7 +49,8 @@ class Finding:
 
     Attributes:
         what: what was looked for.
-        verdict: ``ok``; ``missing``: the default preset cannot run; ``optional``: only some backends need it.
+        verdict: ``ok``; ``missing``: the default preset cannot run; ``optional``: only some backends need it;
+            ``untested``: a version outside the tested range, which may well work.
         found: what was found, or what to do.
     """
 
@@ -56,6 +64,7 @@ def run_checks() -> list[Finding]:
     checks: tuple[Callable[[], list[Finding]], ...] = (
         _python,
         _packages,
+        _versions,
         _presets,
         _renderer,
         _cache,
@@ -77,8 +86,41 @@ def _packages() -> list[Finding]:
     if missing:
         names = " ".join(missing)
         return [Finding("packages", "missing", f"not installed; run `make install` or `pip install {names}`")]
-    found = (f"{package} {_version(package) or '(version not stated)'}" for package in _REQUIRED.values())
+    found = (f"{package} {installed_version(package) or '(version not stated)'}" for package in _REQUIRED.values())
     return [Finding("packages", "ok", ", ".join(found))]
+
+
+def _versions() -> list[Finding]:
+    return [
+        finding
+        for package, (oldest, newest) in TESTED.items()
+        if (finding := compare_version(package, installed_version(package), oldest, newest)) is not None
+    ]
+
+
+def compare_version(package: str, version: str | None, oldest: str, newest: str) -> Finding | None:
+    """A finding when the version is outside the tested range; packages that are not installed are another check's.
+
+    Only the first three numbers count: what follows them names builds.
+    """
+    if version is None or _numbers(oldest) <= _numbers(version) <= _numbers(newest):
+        return None
+    advice = f"if results look wrong, pip install '{package}>={oldest},<={newest}'"
+    return Finding(package, "untested", f"{version}; tested with {oldest} to {newest}: {advice}")
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    return tuple(int(number) for number in re.findall(r"\d+", version)[:3])
+
+
+def installed_version(package: str) -> str | None:
+    """Version of an installed package; OpenCV from apt or from source says it only itself."""
+    version = _version(package)
+    if version is None and package == "opencv-python-headless" and find_spec("cv2") is not None:
+        import cv2
+
+        return cv2.__version__
+    return version
 
 
 def _optional_packages() -> list[Finding]:
@@ -120,7 +162,7 @@ def _renderer() -> list[Finding]:
     target = target_from_scene(trimesh.Scene(trimesh.creation.box((1.0, 1.0, 1.0))), "cube")
     camera = Camera(np.array([[100.0, 0, 31.5], [0, 100.0, 31.5], [0, 0, 1]]), 64, 64)
     start = time.perf_counter()
-    mask = RayRenderer(target).render(lie.transform(np.eye(3), [0, 0, 4.0]), camera, color=False).mask
+    mask = RayRenderer(target).render(lie.transform(np.eye(3), np.array([0.0, 0.0, 4.0])), camera, color=False).mask
     elapsed_ms = 1e3 * (time.perf_counter() - start)
     # A unit cube whose near face is 3.5 m away covers 100 / 3.5 pixels a side.
     side = np.sqrt(np.count_nonzero(mask))
@@ -169,7 +211,8 @@ def _ros() -> list[Finding]:
 
 
 def _weights() -> list[Finding]:
-    from hat_ros.nets.checkpoint import CHECKPOINTS, find, weights_folder
+    from hat_ros.nets.checkpoint import find, weights_folder
+    from hat_ros.nets.checkpoint_registry import CHECKPOINTS
 
     present = []
     for name in CHECKPOINTS:

@@ -98,10 +98,10 @@ class VideoFile:
 
     def __init__(self, stem: Path, width: int, height: int, fps: float) -> None:
         self.path = stem.with_suffix(".mp4")
-        self._writer = cv2.VideoWriter(str(self.path), cv2.VideoWriter_fourcc(*"mp4v"), fps, (width, height))
+        self._writer = cv2.VideoWriter(str(self.path), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width, height))
         if not self._writer.isOpened():
             self.path = stem.with_suffix(".avi")
-            self._writer = cv2.VideoWriter(str(self.path), cv2.VideoWriter_fourcc(*"MJPG"), fps, (width, height))
+            self._writer = cv2.VideoWriter(str(self.path), cv2.VideoWriter.fourcc(*"MJPG"), fps, (width, height))
 
     def add(self, rgb: UInt8) -> None:
         """Append a frame of the size given at the start."""

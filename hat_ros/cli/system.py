@@ -91,7 +91,7 @@ def _doctor(_: argparse.Namespace) -> int:
     table = Table(title="hat doctor")
     for heading in ("check", "", "found"):
         table.add_column(heading, overflow="fold")
-    style = {"ok": "green", "missing": "red", "optional": "yellow"}
+    style = {"ok": "green", "missing": "red", "optional": "yellow", "untested": "yellow"}
     for finding in findings:
         table.add_row(finding.what, Text(finding.verdict, style[finding.verdict]), Text(finding.found))
     Console().print(table)

@@ -26,7 +26,8 @@ class Action:
 @pytest.fixture
 def described(monkeypatch):
     made = {
-        "launch": ("LaunchDescription",),
+        "launch": (),
+        "launch.launch_description": ("LaunchDescription",),
         "launch.actions": ("DeclareLaunchArgument",),
         "launch.conditions": ("IfCondition",),
         "launch.substitutions": ("LaunchConfiguration",),
@@ -65,3 +66,10 @@ def test_every_argument_is_used_and_every_parameter_exists(described):
         parts = target if isinstance(target, list) else [target]
         used |= {part.args[0] for part in parts if isinstance(part, Action)}
     assert used == declared
+
+
+def test_only_the_target_must_be_given(described):
+    defaults = {
+        action.args[0]: action.options["default_value"] for action in of_class(described, "DeclareLaunchArgument")
+    }
+    assert [name for name, value in defaults.items() if value is None] == ["target"]
