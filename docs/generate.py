@@ -6,6 +6,7 @@ each topic is for stands here, since the code needs only its name and type; one 
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import re
 import sys
@@ -197,12 +198,40 @@ def weight_table() -> str:
     return "\n".join(rows)
 
 
+def launch_table() -> str:
+    """Arguments of the launch file."""
+    rows = ["| Argument | Default | Meaning |", "|---|---|---|"]
+    arguments = _literal(ROOT / "launch" / "hat.launch.py", "ARGUMENTS")
+    rows += [f"| `{name}` | `{_plain(value)}` | {doc} |" for name, value, doc in arguments]
+    return "\n".join(rows)
+
+
+def node_table() -> str:
+    """Parameters of the nodes beside the configuration."""
+    rows = ["| Parameter | Default | Meaning |", "|---|---|---|"]
+    options = _literal(ROOT / "hat_ros" / "ros" / "params.py", "_RUN_OPTIONS")
+    rows += [f"| `{name}` | `{_plain(value)}` | {doc} |" for name, (value, doc) in options.items()]
+    return "\n".join(rows)
+
+
+def _literal(path: Path, name: str) -> Any:
+    """A constant of a module that cannot be imported without ROS."""
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            if any(isinstance(target, ast.Name) and target.id == name for target in targets):
+                return ast.literal_eval(node.value)
+    raise LookupError(f"{path} has no constant {name}")
+
+
 GENERATORS: dict[str, Callable[[], str]] = {
     "topics": topic_tables,
     "columns": column_lists,
     "parameters": parameter_tables,
     "presets": preset_table,
     "weights": weight_table,
+    "launch": launch_table,
+    "nodes": node_table,
     "n_parameters": lambda: str(len(flat_options())),
     "n_sections": lambda: str(len(config_to_dict(HatConfig()))),
 }

@@ -8,10 +8,12 @@ The status is a PointCloud2 with one row of named float64 columns, and the stamp
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
@@ -73,15 +75,8 @@ class GncNode(Node):
 def main() -> None:
     """Run until interrupted."""
     rclpy.init()
-    node = GncNode()
-    try:
-        rclpy.spin(node)
-    except KeyboardInterrupt:
-        pass
-    finally:
-        node.destroy_node()
-        if rclpy.ok():
-            rclpy.shutdown()
+    with suppress(KeyboardInterrupt, ExternalShutdownException):
+        rclpy.spin(GncNode())
 
 
 if __name__ == "__main__":

@@ -142,3 +142,11 @@ def test_citation_names_the_paper():
     citation = yaml.safe_load(read(ROOT / "CITATION.cff"))
     assert citation["preferred-citation"]["title"] in read(ROOT / "docs" / "citing.md").replace("\n> ", " ")
     assert "arXiv:2609.21597" in str(citation["preferred-citation"]["identifiers"])
+
+
+def test_launch_arguments_and_node_parameters_are_in_the_reference():
+    params = pytest.importorskip("hat_ros.ros.params")
+    page = GENERATE.fill(read(ROOT / "docs" / "parameters.md"))
+    for name, (_, doc) in params._RUN_OPTIONS.items():
+        assert re.search(rf"\| `{name}` \| `.*` \| {re.escape(doc)} \|", page)
+    assert "| `camera_info` | `/camera_info` |" in page
