@@ -56,7 +56,7 @@ class SourceSpec:
     def sha256(self) -> str:
         """Digest of everything that the recording is made of."""
         if not self.dataset:
-            return input_hash(self.path) if self.detections is None else self._with_detections(input_hash(self.path))
+            return self._with_detections(input_hash(self.path))
         recording = self._in_dataset()
         digest = hashlib.sha256(recording.camera.K.tobytes() + recording.distortion.tobytes())
         for item in recording.files:
@@ -66,9 +66,11 @@ class SourceSpec:
             for path in (item.image, *item.masks):
                 digest.update(input_hash(path).encode())
         digest.update(input_hash(recording.target_path).encode())
-        return digest.hexdigest() if self.detections is None else self._with_detections(digest.hexdigest())
+        return self._with_detections(digest.hexdigest())
 
     def _with_detections(self, rest: str) -> str:
+        if self.detections is None:
+            return rest
         return hashlib.sha256(f"{rest}{input_hash(self.detections)}".encode()).hexdigest()
 
     def describe(self) -> dict[str, str | None]:
@@ -76,9 +78,9 @@ class SourceSpec:
         return {
             "dataset": self.dataset,
             "sequence": self.sequence,
-            "model": self.model and str(self.model.resolve()),
-            "detections": self.detections and str(self.detections.resolve()),
-            "detections_sha256": self.detections and input_hash(self.detections),
+            "model": None if self.model is None else str(self.model.resolve()),
+            "detections": None if self.detections is None else str(self.detections.resolve()),
+            "detections_sha256": None if self.detections is None else input_hash(self.detections),
         }
 
     def open(self) -> Source:
@@ -115,8 +117,9 @@ class Source:
         ``masks``: with the recorded ones.
         """
         stop, recording = None if limit is None else start + limit, self.recording
-        bag = isinstance(recording, BagReader)
-        return islice(_attempts(recording, masks) if bag else recording.frames(stop, masks), start, stop)
+        if isinstance(recording, BagReader):
+            return islice(_attempts(recording, masks), start, stop)
+        return islice(recording.frames(stop, masks), start, stop)
 
     def masks(self, start: int = 0, limit: int | None = None) -> Iterator[tuple[int, UInt8 | None]]:
         """Stamps and recorded masks of the same frames, images left alone."""
@@ -163,7 +166,9 @@ def _masks(bag: BagReader) -> Iterator[tuple[int, UInt8 | None]]:
 
 
 def _mask_of(packet: Packet, bag: BagReader) -> UInt8 | None:
-    return packet.mask and decode_mask(deserialize(packet.mask, "sensor_msgs/msg/Image", bag.path))
+    if packet.mask is None:
+        return None
+    return decode_mask(deserialize(packet.mask, "sensor_msgs/msg/Image", bag.path))
 
 
 def open_source(path: str | Path, detections: Path | None = None) -> Source:

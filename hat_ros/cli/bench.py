@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,7 @@ from hat_ros.bench.methods.modes import MODES
 from hat_ros.cli.options import Commands, add_config, add_dataset, natural, positive
 
 if TYPE_CHECKING:
-    from hat_ros.bench.source import SourceSpec
+    from hat_ros.bench.experiments.comparison import Clip
 
 
 def add_commands(commands: Commands) -> None:
@@ -41,7 +42,7 @@ def _add_run_matrix(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--jobs", type=positive, default=1, metavar="N", help="runs at a time (default: 1)")
 
 
-def _clips(arguments: argparse.Namespace) -> list[tuple[SourceSpec, tuple[str, ...]]]:
+def _clips(arguments: argparse.Namespace) -> list[Clip]:
     """The recordings that the arguments name."""
     from hat_ros.bench.experiments.comparison import clips_named, clips_of_dataset, clips_of_suite
     from hat_ros.errors import UsageError
@@ -62,7 +63,7 @@ def _clips(arguments: argparse.Namespace) -> list[tuple[SourceSpec, tuple[str, .
     return clips
 
 
-def _names(*known: str) -> argparse.Action:
+def _names(*known: str) -> Callable[[str], list[str]]:
     def parse(text: str) -> list[str]:
         names = [name.strip() for name in text.split(",") if name.strip()]
         wrong = [name for name in names if name not in known]

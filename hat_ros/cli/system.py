@@ -48,8 +48,9 @@ def _weights(arguments: argparse.Namespace) -> int:
 
     from hat_ros.errors import UsageError
     from hat_ros.nets import checkpoint
+    from hat_ros.nets.checkpoint_registry import CHECKPOINTS
 
-    names = [arguments.name] if arguments.name else list(checkpoint.CHECKPOINTS)
+    names = [arguments.name] if arguments.name else list(CHECKPOINTS)
     if arguments.action == "convert":
         if not arguments.name:
             raise UsageError("weights convert: name the checkpoint, `hat weights list` shows them")

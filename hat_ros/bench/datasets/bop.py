@@ -97,7 +97,8 @@ def read_scene(
     images = _images(scene)
     for number, image in sorted(images.items()):
         entries = gt.get(str(number), []) if isinstance(gt, dict) else []
-        T_cam_target, masks = None, ()
+        T_cam_target: Float | None = None
+        masks: tuple[Path, ...] = ()
         for index, entry in enumerate(entries):
             if object_id is None or entry.get("obj_id") == object_id:
                 T_cam_target = _pose(entry, f"{scene}/scene_gt.json, image {number}, entry {index}")

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -110,7 +110,9 @@ class ImageRecording:
     @cached_property
     def _maps(self) -> tuple[Float32, Float32]:
         size = (self.camera.width, self.camera.height)
-        return cv2.initUndistortRectifyMap(self.camera.K, self.distortion, None, self.camera.K, size, cv2.CV_32FC1)
+        K = self.camera.K
+        x, y = cv2.initUndistortRectifyMap(K, self.distortion, None, K, size, cv2.CV_32FC1)
+        return np.asarray(x, np.float32), np.asarray(y, np.float32)
 
     def _rectify(self, image: UInt8, path: Path, interpolation: int) -> UInt8:
         if image.shape[:2] != (self.camera.height, self.camera.width):
@@ -120,7 +122,7 @@ class ImageRecording:
             )
         if not self.distortion.any():
             return image
-        return cv2.remap(image, *self._maps, interpolation)
+        return np.asarray(cv2.remap(image, *self._maps, interpolation), np.uint8)
 
 
 def read_rgb(path: Path) -> UInt8:
@@ -129,7 +131,7 @@ def read_rgb(path: Path) -> UInt8:
     Raises:
         DatasetError: missing or not an image.
     """
-    return cv2.cvtColor(_read(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    return np.asarray(cv2.cvtColor(_read(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def _read(path: Path, flags: int) -> UInt8:
@@ -141,15 +143,15 @@ def _read(path: Path, flags: int) -> UInt8:
     image = cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
     if image is None:
         raise DatasetError(f"{path}: not an image that can be decoded; copy the data set again")
-    return image
+    return np.asarray(image, np.uint8)
 
 
-def pose_from_label(quat: Sequence[float], translation_m: Sequence[float], order: str, where: str) -> Float:
+def pose_from_label(quat: object, translation_m: object, order: str, where: str) -> Float:
     """(4, 4) ``T_cam_target`` from a label with ``p_cam = R(q) p + t``.
 
     Args:
-        quat: four numbers in the given order; normalised here.
-        translation_m: three numbers.
+        quat: four numbers in the given order, as they stand in the file; normalised here.
+        translation_m: three numbers, likewise.
         order: ``wxyz`` or ``xyzw``.
         where: for the error: file and entry.
 
@@ -157,7 +159,7 @@ def pose_from_label(quat: Sequence[float], translation_m: Sequence[float], order
         DatasetError: wrong counts, not numbers, not finite, or a quaternion far from unit length.
     """
     try:
-        q, t = np.asarray(quat, dtype=np.float64), np.asarray(translation_m, dtype=np.float64)
+        q, t = np.array(quat, dtype=np.float64), np.array(translation_m, dtype=np.float64)
     except (TypeError, ValueError):
         raise DatasetError(f"{where}: pose label is not made of numbers: {quat}, {translation_m}") from None
     if q.shape != (4,) or t.shape != (3,) or not (np.isfinite(q).all() and np.isfinite(t).all()):
@@ -167,7 +169,7 @@ def pose_from_label(quat: Sequence[float], translation_m: Sequence[float], order
     return lie.transform(lie.matrix_from_quat(q[[1, 2, 3, 0]] if order == "wxyz" else q), t)
 
 
-def camera_from_label(K: object, size: Sequence[int], where: str) -> Camera:
+def camera_from_label(K: object, size: Sequence[Any], where: str) -> Camera:
     """Camera of a data set that gives K and [width, height].
 
     A principal point of exactly half the image size counts from the image corner (renderers do): it is moved by half

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -110,13 +110,14 @@ def import_dataset(
     if boxes and detections is not None:
         raise UsageError("boxes from the labels and detections from elsewhere exclude each other, choose one")
     out, bags = Path(out), []
-    recordings = open_dataset(fmt, root, model, sequences)
+    recordings: Iterable[ImageRecording] = open_dataset(fmt, root, model, sequences)
+    found: dict[str, Path] = {}
     if detections is not None:  # which of them belong to a sequence depends on how many there are
-        recordings = list(recordings)
-        found = detections_by_sequence(Path(detections), recordings)
+        recordings = every = list(recordings)
+        found = detections_by_sequence(Path(detections), every)
     for recording in recordings:
         bag = out if fmt == "sequence" else out / recording.name
-        regions = None if detections is None else found[recording.name]
+        regions = found.get(recording.name)
         made_from = _made_from(fmt, recording, boxes, regions)
         if not _complete(bag, made_from):
             if regions is not None:
@@ -265,14 +266,14 @@ def check_picture(recording: ImageRecording, width_px: int = 640) -> UInt8:
     Raises:
         DatasetError: the recording has no truth.
     """
-    labelled = [item for item in recording.files if item.T_cam_target is not None]
+    labelled = [(item, T) for item in recording.files if (T := item.T_cam_target) is not None]
     if not labelled:
         raise DatasetError(f"{recording.name}: no frame has a true pose, nothing to check")
     renderer = create_renderer("rays", load_target(recording.target_path, recording.unit_scale))
     columns = []
-    for item in (labelled[0], labelled[len(labelled) // 2], labelled[-1]):
+    for item, T_cam_target in (labelled[0], labelled[len(labelled) // 2], labelled[-1]):
         rgb = recording.frame(item).rgb.copy()
-        view = renderer.render(item.T_cam_target, recording.camera)
+        view = renderer.render(T_cam_target, recording.camera)
         contours, _ = cv2.findContours(view.mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(rgb, contours, -1, (0, 255, 0), max(1, rgb.shape[1] // 640))
         height_px = round(rgb.shape[0] * width_px / rgb.shape[1])

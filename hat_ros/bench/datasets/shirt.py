@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from hat_ros.array_types import Float
 from hat_ros.bench.datasets.image_files import ImageFile, ImageRecording, camera_from_label, pose_from_label, stamp_of
 from hat_ros.bench.datasets.sequence import read_json
 from hat_ros.errors import DatasetError
@@ -56,7 +57,7 @@ def open_shirt(root: Path, model: Path | None = None, sequences: Collection[str]
         raise DatasetError(f"{root}: no folder like roe1/synthetic; give the folder that holds camera.json and roe1")
 
 
-def _distortion(values: Any, path: Path) -> np.ndarray:
+def _distortion(values: Any, path: Path) -> Float:
     try:
         coefficients = np.array(values, dtype=np.float64).reshape(-1)
     except (TypeError, ValueError):

@@ -12,7 +12,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
+from hat_ros.array_types import Float
 from hat_ros.bench.evaluation import metrics
 from hat_ros.geometry import lie
 from hat_ros.io.run_log import RunLog
@@ -26,7 +28,7 @@ STATE_COLOR = {
 }
 
 
-def seconds(log: RunLog) -> metrics.Float:
+def seconds(log: RunLog) -> Float:
     """(N,) time since the first frame."""
     return (log.stamp_ns - log.stamp_ns[0]) * 1e-9 if len(log) else np.zeros(0)
 
@@ -116,7 +118,7 @@ def image_bytes(figure: Figure, form: str = "png", dpi: int = 110) -> bytes:
     return out.getvalue()
 
 
-def _shade_states(axis: Axes, t: metrics.Float, log: RunLog) -> None:
+def _shade_states(axis: Axes, t: Float, log: RunLog) -> None:
     for state, first, last in _spans(log):
         axis.axvspan(t[first], t[min(last + 1, len(t) - 1)], color=STATE_COLOR[state], alpha=0.28, linewidth=0)
 
@@ -131,7 +133,7 @@ def _spans(log: RunLog) -> list[tuple[TrackState, int, int]]:
     return [(TrackState(int(log.state[a])), int(a), int(b)) for a, b in zip(starts, ends, strict=True)]
 
 
-def _event_rows(axis: Axes, t: metrics.Float, log: RunLog) -> None:
+def _event_rows(axis: Axes, t: Float, log: RunLog) -> None:
     """Keyframes, anchors, gated anchors and resets as ticks; states as coloured bands with a legend."""
     _shade_states(axis, t, log)
     gated = (log.anchor >= 0) & (log.gate_weight < 1)
@@ -147,7 +149,7 @@ def _event_rows(axis: Axes, t: metrics.Float, log: RunLog) -> None:
     axis.set_ylim(0, len(rows))
     axis.set_xlabel("time (s)")
     present = sorted({state for state, _, _ in _spans(log)})
-    handles = [plt.Rectangle((0, 0), 1, 1, color=STATE_COLOR[state], alpha=0.5) for state in present]
+    handles = [Rectangle((0, 0), 1, 1, color=STATE_COLOR[state], alpha=0.5) for state in present]
     axis.legend(
         handles, [s.name for s in present], loc="upper center", bbox_to_anchor=(0.5, -0.55), ncols=4, fontsize=8
     )

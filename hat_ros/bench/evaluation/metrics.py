@@ -231,10 +231,10 @@ def inside_ellipsoid(T_est: Float, covariance: Float, T_true: Float, probability
     return np.array(inside, dtype=bool)
 
 
-def untrue_tracking_share(states: Sequence[int], errors: PoseErrors, limit_deg: float = UNTRUE_DEG) -> float:
+def untrue_tracking_share(states: Int, errors: PoseErrors, limit_deg: float = UNTRUE_DEG) -> float:
     """Share of the frames more than ``limit_deg`` off that call themselves TRACKING; NaN if there is no such frame."""
     far = errors.scored & (np.degrees(np.nan_to_num(errors.rotation_rad)) > limit_deg)
-    return _share(np.asarray(states)[far] == TrackState.TRACKING)
+    return _share(states[far] == TrackState.TRACKING)
 
 
 def relative_motion_deg(pose_rows: Float, valid: Bool, epoch: Int, T_true: Float) -> Float:
@@ -249,8 +249,8 @@ def relative_motion_deg(pose_rows: Float, valid: Bool, epoch: Int, T_true: Float
     Returns:
         (M,) degrees of the steps that can be judged.
     """
-    truth = np.isfinite(T_true).all(axis=(-1, -2))
-    usable = valid[1:] & valid[:-1] & (epoch[1:] == epoch[:-1]) & truth[1:] & truth[:-1]
+    known: Bool = valid & np.isfinite(T_true).all(axis=(-1, -2))
+    usable = known[1:] & known[:-1] & (epoch[1:] == epoch[:-1])
     R_slam = lie.matrix_from_row(np.where(valid[:, None], pose_rows, lie.row_from_matrix(np.eye(4))))[:, :3, :3]
     step = np.swapaxes(R_slam[1:], -1, -2) @ R_slam[:-1]
     R_true = T_true[:, :3, :3]

@@ -84,8 +84,8 @@ def evaluate_folder(folder: Path, truth: Path | None = None) -> None:
     """
     run, figures, _ = read_folder(folder)
     log = read_result_bag(folder / BAG_FOLDER)
-    source = open_source(truth) if truth is not None else _source_of(run)
-    if truth is not None:
+    source = _source_of(run) if truth is None else open_source(truth)
+    if truth is not None and source is not None:
         first, last = int(log.stamp_ns[0]), int(log.stamp_ns[-1])
         log = log.with_truth({stamp: row for stamp, row in source.truth_rows().items() if first <= stamp <= last})
         if not log.has_truth.any():
@@ -100,7 +100,7 @@ def write_tables(path: Path, log: RunLog) -> None:
     """``poses.tum`` and ``poses.csv`` of a finished run."""
     errors = pose_errors(log.T_est, log.T_true)
     with (path / "poses.tum").open("w", encoding="utf-8", newline="") as tum:
-        for i in np.flatnonzero(log.has_output):
+        for i in map(int, np.flatnonzero(log.has_output)):
             tum.write(tum_line(int(log.stamp_ns[i]), log.pose_rows[i]))
     with (path / POSES_FILE).open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
@@ -186,7 +186,9 @@ def paint_overlay(folder: Path, source: Source, log: RunLog, video: bool) -> lis
     file = VideoFile(folder / "overlay", camera.width, camera.height, _frame_rate(log)) if video else None
     strip = []
     for frame in source.frames():
-        i = index.pop(frame.stamp_ns, None) if isinstance(frame, Frame) else None
+        if not isinstance(frame, Frame):
+            continue
+        i = index.pop(frame.stamp_ns, None)
         if i is None or not (video or frame.stamp_ns in wanted):
             continue
         state, note = TrackState(int(log.state[i])), f"{(log.stamp_ns[i] - log.stamp_ns[0]) * 1e-9:.1f} s"
@@ -196,7 +198,8 @@ def paint_overlay(folder: Path, source: Source, log: RunLog, video: bool) -> lis
             file.add(image)
         if frame.stamp_ns in wanted:
             scale = min(1.0, _STRIP_WIDTH_PX / camera.width)
-            strip.append((f"{note}, {state.name}", cv2.resize(image, None, fx=scale, fy=scale)))
+            small = np.asarray(cv2.resize(image, None, fx=scale, fy=scale), np.uint8)
+            strip.append((f"{note}, {state.name}", small))
     if file is not None:
         file.close()
     return strip

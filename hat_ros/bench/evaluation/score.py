@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from hat_ros.array_types import Float
 from hat_ros.bench.evaluation import metrics
 from hat_ros.io.run_log import RunLog
 from hat_ros.target.model import Target
@@ -56,10 +57,9 @@ def score_run(log: RunLog, target: Target | None = None) -> dict[str, Any]:
     return out
 
 
-def surface_points(target: Target, count: int = ADD_S_POINTS) -> metrics.Float:
+def surface_points(target: Target, count: int = ADD_S_POINTS) -> Float:
     """``count`` points spread over the surface by area, the same for every process: (P, 3) metres."""
-    corners = target.vertices_m[target.faces]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    corners, areas = target.corners_m, target.face_areas_m2
     rng = np.random.default_rng(0)
     face = rng.choice(len(areas), size=count, p=areas / areas.sum())
     a, b = rng.random((2, count))

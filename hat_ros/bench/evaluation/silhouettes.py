@@ -31,7 +31,8 @@ class Silhouettes:
         place = None
         if step.detection is not None:
             mask = step.detection.mask
-            box = cv2.boundingRect(mask.view(np.uint8))
+            left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
+            box = left, top, width, height
             place = self._file.tell(), box
             self._file.write(np.packbits(mask[_within(box)]).tobytes())
         self._places[step.estimate.stamp_ns] = place

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from hat_ros.array_types import Float
 from hat_ros.bench.evaluation import metrics
 from hat_ros.bench.evaluation.tables import Column, Table
 from hat_ros.bench.experiments.ablation_rows import Row, table_rows
@@ -271,7 +272,7 @@ def range_table(observations: Sequence[RunLog]) -> Table:
     return Table("Best appearance by range", _RANGES, lines)
 
 
-def _best_appearance(log: RunLog) -> np.ndarray:
+def _best_appearance(log: RunLog) -> Float:
     """(N, 4, 4) first candidate of every image, NaN without one."""
     rows = [group.pose_rows[0] if len(group) else np.full(7, np.nan) for group in log.candidates]
     return lie.matrix_from_row(np.array(rows).reshape(-1, 7))

@@ -20,6 +20,9 @@ from hat_ros.bench.source import SourceSpec
 from hat_ros.bench.synth.suite import SUITE, SUITE_SETTINGS
 from hat_ros.errors import UsageError
 
+# A recording, and ``key=value`` settings of its own.
+Clip = tuple[SourceSpec, tuple[str, ...]]
+
 GIVEN_MASKS = ("segmentation.backend=annotated",)
 
 _WHERE = (
@@ -96,15 +99,16 @@ class Entry:
         return cls(name, mode, config or default_config, tuple(settings))
 
 
-def clips_named(texts: Sequence[str]) -> list[tuple[SourceSpec, tuple[str, ...]]]:
+def clips_named(texts: Sequence[str]) -> list[Clip]:
     """Recordings, perhaps with settings of their own: ``CLIP`` or ``CLIP@key=value[,key=value]``; CLIP may hold ``*``.
 
     Raises:
         UsageError: there is no such file or folder.
     """
-    clips = []
+    clips: list[Clip] = []
     for text in texts:
-        pattern, settings = text, ()
+        pattern = text
+        settings: tuple[str, ...] = ()
         if not Path(text).exists() and "@" in text:
             pattern, _, rest = text.rpartition("@")
             settings = tuple(rest.split(","))
@@ -115,7 +119,7 @@ def clips_named(texts: Sequence[str]) -> list[tuple[SourceSpec, tuple[str, ...]]
     return clips
 
 
-def clips_of_suite(root: Path) -> list[tuple[SourceSpec, tuple[str, ...]]]:
+def clips_of_suite(root: Path) -> list[Clip]:
     """The bags that ``hat synth suite`` wrote, with the settings that belong to their group.
 
     Raises:
@@ -134,7 +138,7 @@ def clips_of_suite(root: Path) -> list[tuple[SourceSpec, tuple[str, ...]]]:
 
 def clips_of_dataset(
     dataset: str, root: Path, model: Path | None, sequences: Sequence[str], detections: Path | None = None
-) -> list[tuple[SourceSpec, tuple[str, ...]]]:
+) -> list[Clip]:
     """The sequences of a data set as published, without writing bags; each with its detections, if any are given.
 
     Raises:
@@ -148,7 +152,7 @@ def clips_of_dataset(
 
 
 def bench_jobs(
-    clips: Sequence[tuple[SourceSpec, tuple[str, ...]]],
+    clips: Sequence[Clip],
     modes: Sequence[str],
     masks: Sequence[str],
     starts: Sequence[int],
@@ -218,12 +222,15 @@ def stage_table(outcomes: Sequence[Outcome]) -> Table:
 def group_table(outcomes: Sequence[Outcome]) -> Table:
     """Figures per group (data set, or folder of clips): errors pooled over all frames, speed over all time."""
     keys = ("group", "masks", "start", "mode")
-    groups: dict[tuple[str, ...], list[Outcome]] = {}
+    groups: dict[tuple[str, ...], list[tuple[Path, dict[str, Any]]]] = {}
+    methods: dict[tuple[str, ...], str | None] = {}
     for outcome in outcomes:
         if outcome.figures is not None:
-            groups.setdefault(tuple(outcome.job.labels[key] for key in keys), []).append(outcome)
+            group = tuple(outcome.job.labels[key] for key in keys)
+            groups.setdefault(group, []).append((outcome.folder, outcome.figures))
+            methods.setdefault(group, outcome.job.labels.get("method"))
     rows = [
-        {**dict(zip(keys, group, strict=True)), "method": members[0].job.labels.get("method"), **_pooled(members)}
+        {**dict(zip(keys, group, strict=True)), "method": methods[group], **_pooled(members)}
         for group, members in groups.items()
     ]
     columns = (
@@ -249,16 +256,17 @@ _POOLED = {
 }
 
 
-def _pooled(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    errors = np.vstack([read_errors(outcome.folder) for outcome in outcomes])
-    targets = sum(outcome.figures["targets"] for outcome in outcomes)
-    seconds = [outcome.figures["frames"] / fps for outcome in outcomes if (fps := outcome.figures.get("fps"))]
-    frames = sum(outcome.figures["frames"] for outcome in outcomes if outcome.figures.get("fps"))
+def _pooled(runs: Sequence[tuple[Path, dict[str, Any]]]) -> dict[str, Any]:
+    """Figures over all frames of several runs, from their folders and ``metrics.json``."""
+    errors = np.vstack([read_errors(folder) for folder, _ in runs])
+    targets = sum(figures["targets"] for _, figures in runs)
+    seconds = [figures["frames"] / fps for _, figures in runs if (fps := figures.get("fps"))]
+    frames = sum(figures["frames"] for _, figures in runs if figures.get("fps"))
     return {
         **metrics.summarise(metrics.PoseErrors(errors[:, 0], np.radians(errors[:, 1]), errors[:, 2])),
-        "clips": len(outcomes),
+        "clips": len(runs),
         "targets": targets,
-        "coverage": sum(outcome.figures["valid"] for outcome in outcomes) / targets if targets else None,
+        "coverage": sum(figures["valid"] for _, figures in runs) / targets if targets else None,
         "fps": frames / sum(seconds) if seconds else None,
     }
 

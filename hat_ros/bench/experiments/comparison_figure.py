@@ -47,7 +47,7 @@ def _panel(axis: Axes, rows: Sequence[dict[str, Any]]) -> None:
     labels = [_label(row, rows) for row in rows]
     x = np.arange(len(rows))
     mean, sd, fps = (np.array([_number(row.get(key)) for row in rows]) for key in ("E_p_mean", "E_p_sd", "fps"))
-    axis.bar(x, mean, color=[_COLOR.get(row.get("method"), _BASELINE_COLOR) for row in rows], width=0.65)
+    axis.bar(x, mean, color=[_COLOR.get(row.get("method", ""), _BASELINE_COLOR) for row in rows], width=0.65)
     has_sd = np.isfinite(mean) & np.isfinite(sd)
     upwards = [np.zeros(np.count_nonzero(has_sd)), sd[has_sd]]
     axis.errorbar(x[has_sd], mean[has_sd], yerr=upwards, fmt="none", ecolor="#444444", capsize=3, linewidth=1)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hat_ros.array_types import Float
 from hat_ros.config import HatConfig
 from hat_ros.hypotheses.stage import HypothesisStage
 from hat_ros.motion.stage import MotionStage
@@ -98,7 +99,7 @@ class _LastPose:
 
     def __init__(self, refiner: PoseRefiner) -> None:
         self._refiner = refiner
-        self._T_cam_target: np.ndarray | None = None
+        self._T_cam_target: Float | None = None
 
     def start(self, estimate: Estimate) -> None:
         """Follow this pose from the next frame on."""

@@ -11,22 +11,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import overload
 
 import cv2
 import numpy as np
 
-from hat_ros.array_types import Bool, Float
+from hat_ros.array_types import Bool, Float, UInt8
 from hat_ros.bench.methods.framewise import Hat
 from hat_ros.bench.methods.smoothing import smooth_anchors, smooth_measured
 from hat_ros.config import HatConfig
 from hat_ros.geometry import lie
 from hat_ros.motion.stage import suppress_background
 from hat_ros.refinement.contour_refiner import ContourRefiner
-from hat_ros.stages import offline_motions_of
+from hat_ros.stages import PoseRefiner, offline_motions_of
 from hat_ros.target.model import Target
 from hat_ros.tracker import StageWrapper, Step
 from hat_ros.tracking.image_fusion import is_supported, quality
-from hat_ros.types import Camera, Detection, Estimate, Frame, Motion, Refined, TrackState
+from hat_ros.types import Camera, Detection, Estimate, Frame, Motion, TrackState
 
 # The paper's dense refinement rejects what lies further than this from the anchors.
 _SAME_BASIN_DEG = 90.0
@@ -65,7 +66,7 @@ class Offline:
         T_final, covariances = result.T_cam_target, [_NO_COVARIANCE] * len(steps)
         if self._refiner is not None:
             T_final = self._best_known(T_final, result.tied)
-            measured = [self._measured(index, T) for index, T in enumerate(T_final)]
+            measured = [self._measured(self._refiner, index, T) for index, T in enumerate(T_final)]
             covariances = [covariance for _, covariance in measured]
             smooth = smooth_measured(np.stack([T for T, _ in measured]), motions, self._config)
             T_final = np.where(np.isfinite(smooth), smooth, T_final)
@@ -104,7 +105,7 @@ class Offline:
                 out[index] = causal.T_cam_target
         return out
 
-    def _measured(self, index: int, T_decided: Float) -> tuple[Float, Float]:
+    def _measured(self, refiner: PoseRefiner, index: int, T_decided: Float) -> tuple[Float, Float]:
         """The pose (4, 4) that the image of a frame supports near the decided one, and its covariance; NaN: none.
 
         What the causal method measured in the decided basin stands, unless the image clearly prefers another pose
@@ -121,16 +122,12 @@ class Offline:
                 starts.insert(0 if was_measured else 1, T_causal)
         best = None
         for T_start in starts:
-            refined = self._refined(index, T_start)
+            refined = refiner.refine(*self._images.load(index), T_start)
             if quality(refined) > quality(best) + (config.switch_margin if is_supported(best, config) else 0.0):
                 best = refined
         if is_supported(best, config):
             return best.T_cam_target, best.covariance
         return np.full((4, 4), np.nan), _NO_COVARIANCE
-
-    def _refined(self, index: int, T_cam_target: Float) -> Refined | None:
-        frame, detection = self._images.load(index)
-        return self._refiner.refine(frame, detection, T_cam_target)
 
 
 def _apart_deg(T_a: Float, T_b: Float) -> float:
@@ -147,7 +144,15 @@ class _StoredClip(Sequence[tuple[Frame, "Detection | None"]]):
     def __len__(self) -> int:
         return len(self._images)
 
-    def __getitem__(self, index: int) -> tuple[Frame, Detection | None]:
+    @overload
+    def __getitem__(self, index: int) -> tuple[Frame, Detection | None]: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[tuple[Frame, Detection | None]]: ...
+
+    def __getitem__(self, index: int | slice) -> tuple[Frame, Detection | None] | list[tuple[Frame, Detection | None]]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
         frame, detection = self._images[index].load()
         if self._masked and detection is not None:
             frame = replace(frame, rgb=suppress_background(frame.rgb, detection.mask))
@@ -168,18 +173,18 @@ class _StoredImage:
 
     stamp_ns: int
     camera: Camera
-    png: np.ndarray
-    mask_bits: np.ndarray | None
+    png: UInt8
+    mask_bits: UInt8 | None
     silhouette: bool
 
     @classmethod
     def of(cls, frame: Frame, detection: Detection | None) -> _StoredImage:
-        png = cv2.imencode(".png", frame.rgb, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+        png = np.asarray(cv2.imencode(".png", frame.rgb, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1], np.uint8)
         bits = None if detection is None else np.packbits(detection.mask)
         return cls(frame.stamp_ns, frame.camera, png, bits, detection is not None and detection.silhouette)
 
     def load(self) -> tuple[Frame, Detection | None]:
-        frame = Frame(self.stamp_ns, cv2.imdecode(self.png, cv2.IMREAD_COLOR), self.camera)
+        frame = Frame(self.stamp_ns, np.asarray(cv2.imdecode(self.png, cv2.IMREAD_COLOR), np.uint8), self.camera)
         if self.mask_bits is None:
             return frame, None
         shape = (self.camera.height, self.camera.width)

@@ -62,8 +62,8 @@ def smooth_anchors(candidates: Sequence[Candidates], motions: Sequence[Motion], 
     confidence = AreaConfidence(config.fusion)
     graph = PoseGraph(len(motions), config.fusion, config.alignment.lever_m_per_rad)
     anchors, gate_weight, tied = {}, np.full(len(motions), np.nan), np.zeros(len(motions), dtype=bool)
-    for frame in np.flatnonzero(chosen >= 0):
-        anchors[int(frame)] = candidates[frame].T_cam_target[chosen[frame]]
+    for frame in map(int, np.flatnonzero(chosen >= 0)):
+        anchors[frame] = candidates[frame].T_cam_target[chosen[frame]]
         gate_weight[frame] = 1.0
     for epoch in sorted({motion.epoch for motion in motions if motion.valid}):
         joint = [frame for frame in anchors if motions[frame].valid and motions[frame].epoch == epoch]
@@ -174,7 +174,10 @@ def backtrace(candidates: Sequence[Candidates], motions: Sequence[Motion], confi
     With ``running_gate`` the path counts only if the median support over all keyframes and the share of keyframes
     where it overrides appearance pass; otherwise every keyframe takes its best appearance.
     """
-    keyframes, alive, scaled, pointers = [], [], [], []
+    keyframes: list[int] = []
+    alive: list[Int] = []
+    scaled: list[Float] = []
+    pointers: list[Int] = []
     score = np.zeros(0)
     for frame, group in enumerate(candidates):
         scores = scaled_score(group, config)
@@ -231,7 +234,9 @@ def _add_epoch(
             continue
         # The motion drifts: the nearest anchor knows best where the search should start.
         nearest = int(at[np.argmin(np.abs(at - frame))])
-        graph.add_pose(frame, relative_motion(motions[nearest], motion, scale) @ anchors[nearest])
+        carried = relative_motion(motions[nearest], motion, scale)
+        assert carried is not None  # both are valid and of one epoch
+        graph.add_pose(frame, carried @ anchors[nearest])
         frames.append(frame)
         step = relative_motion(motions[frame - 1], motion, scale) if frame else None
         if step is not None:

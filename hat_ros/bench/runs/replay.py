@@ -68,6 +68,8 @@ def replay_bag(path: Path, out: Path, config: HatConfig, options: ReplayOptions,
     source = spec.open()
     if not isinstance(source.recording, BagReader):
         raise UsageError(f"{path} is no bag: `hat import sequence {path} --out BAG` makes one, `hat track` needs none")
+    target = source.recording.target_path
+    assert target is not None  # the source was opened with it
     clock: list[float] = []
 
     def progress(now: graph.Progress) -> None:
@@ -81,7 +83,7 @@ def replay_bag(path: Path, out: Path, config: HatConfig, options: ReplayOptions,
         result = graph.replay(
             path,
             config,
-            source.recording.target_path,
+            target,
             folder.bag_path,
             graph=options.graph,
             credits=options.credits,

@@ -195,7 +195,7 @@ def _expose(radiance: Float32, spec: ClipSpec, index: int) -> UInt8:
     if spec.monochrome:
         image = image @ np.array([0.3, 0.55, 0.15], np.float32)
     if spec.psf_px > 0:
-        image = cv2.GaussianBlur(image, (0, 0), spec.psf_px)
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), spec.psf_px), np.float32)
     rng = np.random.default_rng([spec.seed, 4, index])
     if spec.noise > 0:
         sigma = np.sqrt(np.float32(spec.noise**2) + np.clip(image, 0, 1) / np.float32(_FULL_WELL))

@@ -47,8 +47,7 @@ class Mismatch:
 def apply_mismatch(target: Target, mismatch: Mismatch) -> Target:
     """The spacecraft as it is, in the frame of the CAD model."""
     part = _parts(target)
-    area = _areas(target)
-    part_area = np.bincount(part, area)
+    part_area = np.bincount(part, target.face_areas_m2).astype(np.float64, copy=False)
     if mismatch.panel_turn_deg:
         target = _turn_panels(target, part, part_area, np.radians(mismatch.panel_turn_deg))
     if mismatch.recolor:
@@ -65,11 +64,6 @@ def _parts(target: Target) -> Int32:
     n = len(target.vertices_m)
     labels = connected_components(coo_matrix((np.ones(len(a), bool), (a, b)), (n, n)), directed=False)[1]
     return labels[target.faces[:, 0]]
-
-
-def _areas(target: Target) -> Float:
-    corners = target.vertices_m[target.faces]
-    return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
 
 
 def _turn_panels(target: Target, part: Int32, part_area: Float, angle: float) -> Target:

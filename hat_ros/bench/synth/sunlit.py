@@ -183,7 +183,8 @@ class _MipSampler:
             level = _LINEAR[texture]
             levels = [level]
             while min(level.shape[:2]) > 1:
-                level = cv2.resize(level, (level.shape[1] // 2, level.shape[0] // 2), interpolation=cv2.INTER_AREA)
+                half = cv2.resize(level, (level.shape[1] // 2, level.shape[0] // 2), interpolation=cv2.INTER_AREA)
+                level = np.asarray(half, np.float32)
                 levels.append(level)
             self._levels.append(levels)
         a, b = (self._surface.corner_uv[:, i] - self._surface.corner_uv[:, 0] for i in (1, 2))

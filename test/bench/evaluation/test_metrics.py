@@ -120,7 +120,7 @@ def test_a_singular_covariance_claims_certainty():
 def test_untrue_tracking_share():
     est = np.array([pose((0, 0, a)) for a in (40, 50, 5, 60)])
     errors = metrics.pose_errors(est, np.array([pose()] * 4))
-    states = [TrackState.TRACKING, TrackState.COASTING, TrackState.TRACKING, TrackState.COASTING]
+    states = np.array([TrackState.TRACKING, TrackState.COASTING, TrackState.TRACKING, TrackState.COASTING])
     assert metrics.untrue_tracking_share(states, errors) == pytest.approx(1 / 3)
     assert np.isnan(metrics.untrue_tracking_share(states, metrics.pose_errors(est, est)))
 
