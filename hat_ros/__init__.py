@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hat_ros.config import HatConfig, load_config
-    from hat_ros.target.model import Target, load_target
+    from hat_ros.target.loading import load_target
+    from hat_ros.target.model import Target
     from hat_ros.tracker import HatTracker, Step
     from hat_ros.types import Camera, Detection, Estimate, Frame, TrackState
 
@@ -34,7 +35,7 @@ _EXPORTS = {
     "Target": "target.model",
     "TrackState": "types",
     "load_config": "config",
-    "load_target": "target.model",
+    "load_target": "target.loading",
 }
 
 __all__ = [

@@ -23,7 +23,6 @@ _REQUIRED = {
     "scipy": "scipy",
     "cv2": "opencv-python-headless",
     "trimesh": "trimesh",
-    "embreex": "embreex",
     "numba": "numba",
     "rosbags": "rosbags",
     "mcap": "mcap",
@@ -155,7 +154,7 @@ def _renderer() -> list[Finding]:
     import trimesh
 
     from hat_ros.geometry import lie
-    from hat_ros.target.model import target_from_scene
+    from hat_ros.target.loading import target_from_scene
     from hat_ros.target.ray_renderer import RayRenderer
     from hat_ros.types import Camera
 
@@ -164,11 +163,13 @@ def _renderer() -> list[Finding]:
     start = time.perf_counter()
     mask = RayRenderer(target).render(lie.transform(np.eye(3), np.array([0.0, 0.0, 4.0])), camera, color=False).mask
     elapsed_ms = 1e3 * (time.perf_counter() - start)
+    caster = f"Embree {_version('embreex')}" if find_spec("embreex") else "compiled rays (embreex is not installed)"
     # A unit cube whose near face is 3.5 m away covers 100 / 3.5 pixels a side.
     side = np.sqrt(np.count_nonzero(mask))
     if abs(side - 100 / 3.5) > 1.0:
-        return [Finding("renderer", "missing", f"embree drew a cube {side:.1f} px wide instead of {100 / 3.5:.1f} px")]
-    return [Finding("renderer", "ok", f"embree, test view in {elapsed_ms:.1f} ms")]
+        found = f"{caster} drew a cube {side:.1f} px wide instead of {100 / 3.5:.1f} px"
+        return [Finding("renderer", "missing", found)]
+    return [Finding("renderer", "ok", f"{caster}, test view in {elapsed_ms:.1f} ms")]
 
 
 def _cache() -> list[Finding]:

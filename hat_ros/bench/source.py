@@ -21,7 +21,8 @@ from hat_ros.io.bag_reader import BagReader, Packet
 from hat_ros.io.images import decode_image, decode_mask
 from hat_ros.io.provenance import input_hash
 from hat_ros.io.rosbag import deserialize
-from hat_ros.target.model import Target, load_target
+from hat_ros.target.loading import load_target
+from hat_ros.target.model import Target
 from hat_ros.types import Frame
 
 

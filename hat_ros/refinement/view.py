@@ -22,8 +22,8 @@ from hat_ros.target.contour import (
     contour_table,
 )
 from hat_ros.target.model import Target
-from hat_ros.target.outline import Outlined, Rays, cast_outlined
 from hat_ros.target.rays import Hits, ray_caster
+from hat_ros.target.silhouette import Rays, SeenSilhouette, cast_silhouette
 from hat_ros.types import Camera
 
 # Margin of the rendered crop around the target, in crop pixels: the contour needs background on both sides.
@@ -57,7 +57,7 @@ class View:
     origin_px: Float
     scale: float
     T_cam_target: Float
-    seen: Outlined
+    seen: SeenSilhouette
     lit: Bool | None = None
 
     def shifted(self, shift_px: Float) -> View:
@@ -127,7 +127,7 @@ class TargetViewer:
         crop = Camera(K, width + width % 2, height + height % 2)
         R, t = T_cam_target[:3, :3], T_cam_target[:3, 3]
         to_ray = np.ascontiguousarray((R.T @ np.linalg.inv(crop.K)).T)  # rays in the target frame: affine in the pixel
-        seen = cast_outlined(self._caster, crop.width, crop.height, to_ray, -t @ R)
+        seen = cast_silhouette(self._caster, crop.width, crop.height, to_ray, -t @ R)
         view = View(seen.mask, seen.depth_m, crop, origin, scale, T_cam_target, seen)
         return view if to_sun_cam is None else self.in_sunlight(view, to_sun_cam)
 

@@ -70,7 +70,7 @@ class Settings:
             ConfigError: the parameter is empty.
             MeshError: the model is unusable.
         """
-        from hat_ros.target.model import load_target  # seconds of imports that not every node needs
+        from hat_ros.target.loading import load_target  # seconds of imports that not every node needs
 
         if not self.target:
             raise ConfigError("parameter 'target' is empty: give the CAD model or target.yaml, -p target:=FILE")

@@ -96,7 +96,7 @@ class ClassicalSegmenter:
         step = max(1, round(max(x1 - x0, y1 - y0) / self._config.work_side_px))
         width, height = -(-(x1 - x0) // step) * step, -(-(y1 - y0) // step) * step
         crop = frame.camera.crop(x0, y0, width, height, 1 / step)
-        part = self._renderer.outlined(prior.T_cam_target, crop)
+        part = self._renderer.quick_silhouette(prior.T_cam_target, crop)
         if not part.any():
             return None
         mask = np.zeros(frame.rgb.shape[:2], np.uint8)

@@ -6,10 +6,8 @@ its two orientations together or not at all, and a pose of the past finds only i
 
 from __future__ import annotations
 
-from itertools import permutations, product
-
 import numpy as np
-from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from hat_ros.array_types import Float, UInt8
 from hat_ros.cache import cached_arrays
@@ -50,7 +48,7 @@ def near_symmetries(target: Target) -> Float:
 
     def silhouettes(turn: Float) -> list[UInt8]:
         poses = (lie.transform(R @ turn, position - R @ turn @ target.center_m) for R in look_inwards(_N_VIEWS))
-        return [renderer.outlined(T, camera).view(np.uint8) for T in poses]
+        return [renderer.quick_silhouette(T, camera).view(np.uint8) for T in poses]
 
     as_it_is = silhouettes(np.eye(3))
     turns = _turns(target)
@@ -59,7 +57,7 @@ def near_symmetries(target: Target) -> Float:
     return turns[order[alike[order] >= _MIN_OVERLAP][:_MAX_TURNS]]
 
 
-def turned(T_cam_target: Float, turn: Float, center_m: Float) -> NDArray:
+def turned(T_cam_target: Float, turn: Float, center_m: Float) -> Float:
     """A pose (4, 4) with the target turned (3, 3) about a point of its own (3,)."""
     R = T_cam_target[:3, :3]
     return lie.transform(R @ turn, T_cam_target[:3, 3] + R @ (center_m - turn @ center_m))
@@ -71,11 +69,8 @@ def _turns(target: Target) -> Float:
     _, axes = np.linalg.eigh(np.cov(target.corners_m.reshape(-1, 3).T, aweights=weights))
     kept = [np.eye(3)]
     for about in (np.eye(3), axes):
-        for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-            cube = np.zeros((3, 3))
-            cube[range(3), order] = signs
+        for cube in np.rint(Rotation.create_group("O").as_matrix()):
             turn = about @ cube @ about.T
-            far = np.degrees(lie.angle_between(np.stack(kept), turn)).min() > _SEPARATION_DEG
-            if np.linalg.det(cube) > 0 and far:
+            if np.degrees(lie.angle_between(np.stack(kept), turn)).min() > _SEPARATION_DEG:
                 kept.append(turn)
     return np.stack(kept[1:])

@@ -7,7 +7,8 @@ import trimesh
 from trimesh.visual.material import PBRMaterial
 
 from hat_ros.array_types import Float
-from hat_ros.target.model import Target, target_from_scene
+from hat_ros.target.loading import target_from_scene
+from hat_ros.target.model import Target
 
 # sRGB: foil, white paint, grey paint, black paint, red and green markings.
 _COLOURS = ((214, 166, 80), (226, 226, 220), (128, 130, 134), (40, 40, 44), (168, 50, 40), (60, 120, 80))

@@ -15,7 +15,7 @@ from hat_ros.nets import gigapose as gp
 from hat_ros.nets import megapose as mp
 from hat_ros.nets.runtime import Runtime
 from hat_ros.stages import create_backend
-from hat_ros.target.model import target_from_scene
+from hat_ros.target.loading import target_from_scene
 from hat_ros.target.sphere import look_inwards_upright
 from hat_ros.types import Camera, Detection, Frame
 

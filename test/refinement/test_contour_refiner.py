@@ -8,7 +8,7 @@ from hat_ros.config import RefinementConfig
 from hat_ros.geometry import lie
 from hat_ros.refinement.contour_refiner import ContourRefiner
 from hat_ros.refinement.sunlight import Sunlight, SunMatcher
-from hat_ros.target.model import target_from_scene
+from hat_ros.target.loading import target_from_scene
 from hat_ros.tracking.image_fusion import is_supported
 from hat_ros.types import Detection, Frame, RotationPrior
 

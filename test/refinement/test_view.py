@@ -7,8 +7,8 @@ from hat_ros.geometry import lie
 from hat_ros.refinement.mask_field import MaskField
 from hat_ros.refinement.pose_fitter import PoseFitter
 from hat_ros.refinement.view import TargetViewer
-from hat_ros.target.outline import spread_grid
 from hat_ros.target.ray_renderer import RayRenderer
+from hat_ros.target.silhouette import spread_grid
 from hat_ros.types import Camera
 
 BLACK = np.zeros((CAMERA.height, CAMERA.width), np.uint8)

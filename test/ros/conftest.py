@@ -10,7 +10,7 @@ from hat_ros.bench.synth.clips import ClipSpec, render_clip
 from hat_ros.bench.synth.models import write_model
 from hat_ros.config import load_config
 from hat_ros.io.bag_writer import BagWriter
-from hat_ros.target.model import load_target
+from hat_ros.target.loading import load_target
 
 SPEC = ClipSpec(
     frames=N_FRAMES, width=160, height=120, focal_px=260.0, range_m=(8.0, 7.0), supersample=1, spin_deg_per_frame=2.0

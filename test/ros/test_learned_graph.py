@@ -22,7 +22,7 @@ from hat_ros.io.result_bag import read_result_bag
 from hat_ros.io.rosbag import TYPESTORE
 from hat_ros.ros.diagnostics import ERROR
 from hat_ros.stages import create_backend
-from hat_ros.target.model import load_target
+from hat_ros.target.loading import load_target
 
 torch = pytest.importorskip("torch")
 

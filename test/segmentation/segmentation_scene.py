@@ -7,7 +7,7 @@ import numpy as np
 import trimesh
 
 from hat_ros.geometry import lie
-from hat_ros.target.model import target_from_scene
+from hat_ros.target.loading import target_from_scene
 from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.types import Camera, Frame, PosePrior
 

@@ -7,7 +7,7 @@ from hat_ros.config import ClassicalConfig
 from hat_ros.segmentation.lit import LitBody
 from hat_ros.segmentation.shape import SilhouetteBank
 from hat_ros.segmentation.sky import lit_regions, measure_sky
-from hat_ros.target.model import target_from_scene
+from hat_ros.target.loading import target_from_scene
 from hat_ros.target.ray_renderer import RayRenderer
 
 

@@ -12,7 +12,7 @@ import trimesh
 
 from hat_ros.config import DroidConfig, HatConfig, SlamConfig
 from hat_ros.geometry import lie
-from hat_ros.target.model import target_from_scene
+from hat_ros.target.loading import target_from_scene
 from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.types import Camera, Detection, Frame
 

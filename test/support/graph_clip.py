@@ -15,7 +15,7 @@ from hat_ros.io import messages, topics
 from hat_ros.io.bag_reader import BagReader
 from hat_ros.io.result_bag import ResultBagWriter
 from hat_ros.io.rosbag import TYPESTORE
-from hat_ros.target.model import load_target
+from hat_ros.target.loading import load_target
 from hat_ros.tracker import HatTracker
 
 N_FRAMES = 14

@@ -6,8 +6,9 @@ import trimesh
 
 from hat_ros.bench.synth.sunlit import Light, SunlitRenderer
 from hat_ros.geometry import lie
-from hat_ros.target.model import srgb_from_linear, target_from_scene
+from hat_ros.target.loading import target_from_scene
 from hat_ros.target.ray_renderer import RayRenderer
+from hat_ros.target.srgb import srgb_from_linear
 from hat_ros.types import Camera, Frame
 
 CAMERA = Camera(np.array([[500.0, 0, 159.5], [0, 500.0, 119.5], [0, 0, 1]]), 320, 240)

@@ -8,7 +8,7 @@ from scipy import ndimage
 
 from hat_ros.geometry import lie
 from hat_ros.target import network_views
-from hat_ros.target.model import target_from_scene
+from hat_ros.target.loading import target_from_scene
 from hat_ros.target.network_views import NetworkViewRenderer, encode_normal
 from hat_ros.target.rays import pixel_rays, ray_caster
 from hat_ros.types import Camera

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hat_ros.bench.synth.models import build_target
 from hat_ros.errors import ConfigError, MissingDependencyError
 from hat_ros.geometry import lie
-from hat_ros.target.model import target_from_scene
+from hat_ros.target.loading import target_from_scene
 from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.target.rays import pixel_rays
 from hat_ros.target.rendering import create_renderer
@@ -157,7 +157,7 @@ def test_pyrender_agrees_or_says_what_is_missing():
 
 
 @pytest.mark.parametrize("t", [(0, 0, 4), (0.3, -0.2, 2.5), (1.3, 0.9, 3), (0, 0, 60)])
-def test_an_outlined_silhouette_is_the_silhouette_but_for_specks(t):
+def test_a_quick_silhouette_is_the_silhouette_but_for_specks(t):
     body = trimesh.util.concatenate(
         [
             trimesh.creation.box((1, 0.7, 0.6)),
@@ -166,11 +166,11 @@ def test_an_outlined_silhouette_is_the_silhouette_but_for_specks(t):
     )
     renderer = RayRenderer(scene_target(body))
     for rotvec in ((0, 0, 0), (0.4, -0.8, 0.3), (1.5, 0.2, 2.0)):
-        whole, outlined = (cast(at(t, rotvec), CAMERA) for cast in (renderer.silhouette, renderer.outlined))
-        assert outlined.shape == whole.shape and outlined.dtype == np.bool_
-        assert not (outlined & ~whole).any()
-        assert np.count_nonzero(whole & ~outlined) <= 0.02 * np.count_nonzero(whole)
+        whole, quick = (cast(at(t, rotvec), CAMERA) for cast in (renderer.silhouette, renderer.quick_silhouette))
+        assert quick.shape == whole.shape and quick.dtype == np.bool_
+        assert not (quick & ~whole).any()
+        assert np.count_nonzero(whole & ~quick) <= 0.02 * np.count_nonzero(whole)
 
 
-def test_nothing_is_outlined_behind_the_camera():
-    assert not RayRenderer(scene_target(trimesh.creation.box())).outlined(at((0, 0, -4)), CAMERA).any()
+def test_there_is_no_quick_silhouette_behind_the_camera():
+    assert not RayRenderer(scene_target(trimesh.creation.box())).quick_silhouette(at((0, 0, -4)), CAMERA).any()

@@ -14,7 +14,7 @@ from hat_ros.geometry import lie
 from hat_ros.target import rays
 from hat_ros.target.bvh import BvhCaster
 from hat_ros.target.embree import EmbreeCaster
-from hat_ros.target.model import target_from_scene
+from hat_ros.target.loading import target_from_scene
 from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.target.rays import build_caster, ray_caster
 from hat_ros.tracker import HatTracker

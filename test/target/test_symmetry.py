@@ -8,7 +8,7 @@ from shape_scene import CAMERA, picture, pose_errors, random_pose, spacecraft
 from hat_ros.config import HatConfig
 from hat_ros.geometry import lie
 from hat_ros.hypotheses.template import TemplateHypotheses
-from hat_ros.target.model import target_from_scene
+from hat_ros.target.loading import target_from_scene
 from hat_ros.target.symmetry import load_or_find_symmetries, near_symmetries, turned
 from hat_ros.types import Camera, Detection, PosePrior
 

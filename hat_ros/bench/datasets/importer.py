@@ -20,7 +20,7 @@ from hat_ros.errors import DatasetError, UsageError
 from hat_ros.io.bag_writer import BagWriter
 from hat_ros.io.detections import load_detections
 from hat_ros.io.provenance import input_hash
-from hat_ros.target.model import load_target
+from hat_ros.target.loading import load_target
 from hat_ros.target.rendering import create_renderer
 
 LOG = logging.getLogger(__name__)

@@ -17,7 +17,8 @@ from hat_ros.bench.synth.backdrop import Earth, EarthView, Table, stars
 from hat_ros.bench.synth.sunlit import Light, SunlitRenderer
 from hat_ros.errors import UsageError
 from hat_ros.geometry import lie
-from hat_ros.target.model import Target, srgb_from_linear
+from hat_ros.target.model import Target
+from hat_ros.target.srgb import srgb_from_linear
 from hat_ros.types import Camera
 
 Progress = Callable[[int, int], None]

@@ -14,7 +14,8 @@ from scipy.sparse.csgraph import connected_components
 from hat_ros.array_types import Bool, Float, Int32, UInt8
 from hat_ros.errors import UsageError
 from hat_ros.geometry import lie
-from hat_ros.target.model import Surface, Target, linear_from_srgb, srgb_from_linear
+from hat_ros.target.model import Surface, Target
+from hat_ros.target.srgb import linear_from_srgb, srgb_from_linear
 
 # A part is a panel when it is this thin for its width and carries this share of the model's surface.
 _PANEL_THINNESS = 0.12

@@ -17,7 +17,8 @@ from trimesh.visual.texture import TextureVisuals
 
 from hat_ros.array_types import Float
 from hat_ros.errors import UsageError
-from hat_ros.target.model import Target, target_from_scene
+from hat_ros.target.loading import target_from_scene
+from hat_ros.target.model import Target
 
 _TILE_M = 0.5
 

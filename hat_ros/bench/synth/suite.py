@@ -16,7 +16,7 @@ from hat_ros.bench.synth.clips import ClipSpec, trajectory, write_clip
 from hat_ros.bench.synth.mismatch import Mismatch, apply_mismatch
 from hat_ros.bench.synth.models import write_model
 from hat_ros.errors import UsageError
-from hat_ros.target.model import load_target
+from hat_ros.target.loading import load_target
 
 
 @dataclass(frozen=True)

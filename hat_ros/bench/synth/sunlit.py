@@ -14,9 +14,10 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from hat_ros.array_types import Float, Float32, Int32
-from hat_ros.target.model import Surface, Target, linear_from_srgb
+from hat_ros.target.model import Surface, Target, area_vectors
 from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.target.rays import pixel_rays
+from hat_ros.target.srgb import linear_from_srgb
 from hat_ros.types import Camera
 
 # Face normals closer than this are smoothed over, so that turned parts look round and box edges stay sharp.
@@ -147,9 +148,7 @@ def _ggx(
 
 def smoothed_normals(target: Target) -> Float32:
     """(F, 3, 3) unit normals at the corners of each face, smoothed over neighbours within the crease angle."""
-    corners = target.vertices_m[target.faces]
-    weighted = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    unit = weighted / np.linalg.norm(weighted, axis=1, keepdims=True)
+    weighted, unit = area_vectors(target.corners_m), target.face_normals
     n_faces, n_vertices = len(target.faces), len(target.vertices_m)
     incidence = csr_matrix(
         (np.ones(3 * n_faces), (np.repeat(np.arange(n_faces), 3), target.faces.ravel())), (n_faces, n_vertices)

@@ -23,7 +23,7 @@ from hat_ros.bench.datasets.sequence import load_sequence, write_labels
 from hat_ros.errors import DatasetError, MeshError, UsageError
 from hat_ros.geometry import lie
 from hat_ros.io.bag_reader import BagReader
-from hat_ros.target.model import load_target
+from hat_ros.target.loading import load_target
 from hat_ros.types import Camera
 
 K = np.array([[300.0, 0.0, 79.0], [0.0, 310.0, 60.0], [0.0, 0.0, 1.0]])

@@ -16,7 +16,7 @@ from hat_ros.bench.synth.suite import CLIPS, SUITE, Clip, synthesize, write_suit
 from hat_ros.errors import UsageError
 from hat_ros.geometry import lie
 from hat_ros.io.bag_reader import BagReader
-from hat_ros.target.model import load_target
+from hat_ros.target.loading import load_target
 from hat_ros.target.ray_renderer import RayRenderer
 
 SMALL = ClipSpec(frames=3, width=96, height=72, focal_px=150.0, range_m=(8.0, 6.0))

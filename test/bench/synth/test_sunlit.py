@@ -8,7 +8,7 @@ from trimesh.visual.material import PBRMaterial
 
 from hat_ros.bench.synth.sunlit import Light, SunlitRenderer, smoothed_normals
 from hat_ros.geometry import lie
-from hat_ros.target.model import target_from_scene
+from hat_ros.target.loading import target_from_scene
 from hat_ros.types import Camera
 
 CAMERA = Camera(np.array([[200.0, 0.0, 63.5], [0.0, 200.0, 47.5], [0.0, 0.0, 1.0]]), 128, 96)

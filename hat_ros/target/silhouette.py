@@ -1,4 +1,4 @@
-"""Which rays a silhouette needs: every second pixel, then all pixels near the outline that these found. Compiled."""
+"""A silhouette with a third of the rays: every second pixel, then all pixels near the outline found. Compiled."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hat_ros.target.rays import Hits, RayCaster
 Rays = tuple[Float32, Float32]
 
 
-class Outlined(NamedTuple):
+class SeenSilhouette(NamedTuple):
     """A silhouette with its depth near the outline, and the rays that found it.
 
     Attributes:
@@ -34,7 +34,7 @@ class Outlined(NamedTuple):
     scattered: tuple[Rays, Hits]
 
 
-def cast_outlined(caster: RayCaster, width: int, height: int, to_ray: Float, origin: Float) -> Outlined:
+def cast_silhouette(caster: RayCaster, width: int, height: int, to_ray: Float, origin: Float) -> SeenSilhouette:
     """Silhouette on a crop of even size with a third of the rays; a speck between the grid's rays is lost.
 
     Args:
@@ -48,7 +48,7 @@ def cast_outlined(caster: RayCaster, width: int, height: int, to_ray: Float, ori
     near = scattered_rays(x, y, to_ray, origin)
     near_hits = caster.trace(*near)
     place_pixels(mask, depth_m, x, y, near_hits.face, near_hits.distance)
-    return Outlined(mask, depth_m, (rays, hits), x, y, (near, near_hits))
+    return SeenSilhouette(mask, depth_m, (rays, hits), x, y, (near, near_hits))
 
 
 @njit(cache=True, nogil=True)

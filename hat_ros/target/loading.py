@@ -1,0 +1,214 @@
+"""Reading CAD models: from a mesh file or a ``target.yaml`` to a :class:`hat_ros.target.model.Target`.
+
+The coordinates are the file's own, with the transforms of its scene graph applied and no change of axes: a glTF stays
+y-up if it was modelled so.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from hat_ros.array_types import Bool, Float, Float32, Int, UInt8
+from hat_ros.errors import MeshError
+from hat_ros.target.mesh_file import read_scene, read_target_yaml
+from hat_ros.target.model import Surface, Target, area_vectors, triangle_areas
+from hat_ros.target.srgb import linear_from_srgb, srgb_from_linear
+
+MAX_TEXTURE_SIDE_PX = 2048
+MAX_SOURCE_TEXTURE_PX = 64 * 2**20
+EXTENT_RANGE_M = (1e-3, 1e3)
+
+_GREY = 160
+# Barycentric sample points for the mean colour of a face: centroids of a regular 4 x 4 subdivision.
+_FACE_SAMPLES = np.array(
+    [((3 * i + 1) / 12, (3 * j + 1) / 12, (10 - 3 * i - 3 * j) / 12) for i in range(4) for j in range(4 - i)]
+    + [((3 * i + 2) / 12, (3 * j + 2) / 12, (8 - 3 * i - 3 * j) / 12) for i in range(3) for j in range(3 - i)]
+)
+
+
+def load_target(path: str | Path, unit_scale: float = 1.0) -> Target:
+    """Read a CAD model (obj, ply, stl, glb) or a ``target.yaml`` that names one.
+
+    ``target.yaml`` holds ``mesh`` (file beside it), ``unit_scale`` (metres per file unit) and ``name``.
+
+    Args:
+        path: the file.
+        unit_scale: metres per unit of the file; multiplies the one of a ``target.yaml``.
+
+    Raises:
+        MeshError: unreadable, other format, empty, not finite, or of absurd size or extent.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MeshError(f"CAD model {path}: no such file")
+    if path.suffix.lower() in (".yaml", ".yml"):
+        path, scale, name = read_target_yaml(path)
+        return target_from_scene(read_scene(path), name, unit_scale * scale)
+    return target_from_scene(read_scene(path), path.stem, unit_scale)
+
+
+def target_from_scene(scene: trimesh.Scene, name: str, unit_scale: float = 1.0) -> Target:
+    """A target from a ``trimesh`` scene, its transforms applied.
+
+    Raises:
+        MeshError: no triangles, NaN, or absurd extents.
+    """
+    if not (np.isfinite(unit_scale) and unit_scale > 0):
+        raise MeshError(f"CAD model {name}: unit_scale must be a positive number, found {unit_scale}")
+    found = (_part(scene, node, name) for node in sorted(scene.graph.nodes_geometry))
+    parts = [part for part in found if part is not None]
+    if not parts:
+        raise MeshError(f"CAD model {name}: it holds no triangles; export the surface as a triangle mesh")
+    corners = np.concatenate([part.corners_m for part in parts]) * unit_scale
+    _check_extent(corners, name, unit_scale)
+    # Exporters split vertices at texture seams, with rounding noise: merge what a millionth of the extent separates.
+    origin, extent = corners.min(axis=(0, 1)), np.ptp(corners.reshape(-1, 3), axis=0).max()
+    grid = np.rint((corners - origin) / (1e-6 * extent))
+    keep = triangle_areas(grid) > 0
+    if not keep.any():
+        raise MeshError(f"CAD model {name}: every triangle has zero area")
+    _, first, index = np.unique(grid[keep].reshape(-1, 3), axis=0, return_index=True, return_inverse=True)
+    vertices = corners[keep].reshape(-1, 3)[first]
+    faces = index.reshape(-1, 3).astype(np.int32)
+    surface, face_rgb = _surface(parts, keep)
+    digest = hashlib.sha256()
+    for array in (vertices, faces, face_rgb):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    for array in (vertices, faces, face_rgb):
+        array.setflags(write=False)
+    return Target(name, vertices, faces, face_rgb, surface, digest.hexdigest())
+
+
+@dataclass(frozen=True)
+class _Part:
+    corners_m: Float  # (F, 3, 3)
+    corner_uv: Float32  # (F, 3, 2)
+    corner_rgb: UInt8 | None  # (F, 3, 3)
+    corner_normal: Float32  # (F, 3, 3)
+    rgb: UInt8  # (F, 3)
+    texture: UInt8 | None
+    roughness: float
+    metallic: float
+
+
+def _part(scene: trimesh.Scene, node: str, name: str) -> _Part | None:
+    T, geometry_name = scene.graph[node]
+    mesh = scene.geometry[geometry_name]
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        return None
+    faces = np.asarray(mesh.faces)
+    if faces.min() < 0 or faces.max() >= len(mesh.vertices):
+        raise MeshError(f"CAD model {name}: part '{geometry_name}' has faces that refer to missing vertices")
+    vertices = np.asarray(mesh.vertices, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
+    n_faces = len(faces)
+    corner_uv = np.zeros((n_faces, 3, 2), np.float32)
+    corner_rgb, texture, rgb = None, None, np.full((n_faces, 3), _GREY, np.uint8)
+    roughness, metallic = 0.6, 0.0
+    visual = mesh.visual
+    if isinstance(visual, trimesh.visual.TextureVisuals):
+        rgb[:], texture, roughness, metallic = _material(visual.material)
+        uv = None if visual.uv is None else np.asarray(visual.uv, dtype=np.float32)
+        if uv is None or len(uv) != len(mesh.vertices) or not np.isfinite(uv).all():
+            texture = None
+        elif texture is not None:
+            corner_uv = uv[faces]
+    elif isinstance(visual, trimesh.visual.ColorVisuals) and visual.kind == "vertex":
+        corner_rgb = np.asarray(visual.vertex_colors, dtype=np.uint8)[:, :3][faces]
+    elif isinstance(visual, trimesh.visual.ColorVisuals) and visual.kind == "face":
+        rgb = np.asarray(visual.face_colors, dtype=np.uint8)[:, :3].copy()
+    normal = _corner_normals(mesh, vertices[faces], faces, T[:3, :3])
+    return _Part(vertices[faces], corner_uv, corner_rgb, normal, rgb, texture, roughness, metallic)
+
+
+def _corner_normals(mesh: trimesh.Trimesh, corners: Float, faces: Int, linear: Float) -> Float32:
+    """Unit (F, 3, 3) normals: the file's, or the faces' own where it brings none."""
+    flat = area_vectors(corners)[:, None].repeat(3, axis=1)
+    normal = flat
+    # trimesh would compute vertex normals on demand; only those read from the file are in its cache at this point.
+    if "vertex_normals" in mesh._cache:
+        own = np.asarray(mesh.vertex_normals, dtype=np.float64) @ np.linalg.pinv(linear)
+        normal = np.where(np.isfinite(own[faces]).all(axis=-1, keepdims=True), own[faces], flat)
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    normal = np.where(length > 1e-12, normal, flat)
+    return (normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-300)).astype(np.float32)
+
+
+def _material(material: Any) -> tuple[UInt8, UInt8 | None, float, float]:
+    """Colour (3,) sRGB, texture or None, roughness and metallic of a trimesh material."""
+    is_pbr = isinstance(material, trimesh.visual.material.PBRMaterial)
+    if is_pbr:
+        factor, image = material.baseColorFactor, material.baseColorTexture
+        # What glTF leaves out is 1: matt metal.
+        roughness = 1.0 if material.roughnessFactor is None else float(np.clip(material.roughnessFactor, 0.05, 1))
+        metallic = 1.0 if material.metallicFactor is None else float(np.clip(material.metallicFactor, 0, 1))
+    else:
+        factor, image = getattr(material, "diffuse", None), getattr(material, "image", None)
+        roughness, metallic = 0.6, 0.0
+    factor = np.full(3, 255.0) if factor is None else np.asarray(factor, dtype=np.float64).reshape(-1)[:3]
+    # glTF factors are linear, its textures and everything of OBJ are sRGB.
+    color = srgb_from_linear(factor / 255.0) if is_pbr else np.rint(factor).astype(np.uint8)
+    if image is None:
+        return color, None, roughness, metallic
+    if image.size[0] * image.size[1] > MAX_SOURCE_TEXTURE_PX:
+        raise MeshError(
+            f"CAD model: a texture of {image.size[0]}x{image.size[1]} px is larger than the accepted "
+            f"{MAX_SOURCE_TEXTURE_PX // 2**20} megapixels; scale it down"
+        )
+    image = image.convert("RGB")
+    if max(image.size) > MAX_TEXTURE_SIDE_PX:
+        image.thumbnail((MAX_TEXTURE_SIDE_PX, MAX_TEXTURE_SIDE_PX))
+    texture = np.array(image, dtype=np.uint8)
+    if is_pbr and factor.min() < 254.5:
+        texture = srgb_from_linear(linear_from_srgb(texture) * (factor / 255.0))
+    return color, texture, roughness, metallic
+
+
+def _surface(parts: list[_Part], keep: Bool) -> tuple[Surface, UInt8]:
+    counts = [len(part.rgb) for part in parts]
+    textures: list[UInt8] = []
+    texture_id = []
+    for part, count in zip(parts, counts, strict=True):
+        index = -1
+        if part.texture is not None:
+            index = next((i for i, other in enumerate(textures) if other is part.texture), len(textures))
+            if index == len(textures):
+                textures.append(part.texture)
+        texture_id.append(np.full(count, index, np.int16))
+    corner_rgb = None
+    if any(part.corner_rgb is not None for part in parts):
+        corner_rgb = np.concatenate(
+            [np.repeat(p.rgb[:, None], 3, axis=1) if p.corner_rgb is None else p.corner_rgb for p in parts]
+        )[keep]
+    surface = Surface(
+        np.concatenate([part.corner_uv for part in parts])[keep],
+        corner_rgb,
+        np.concatenate([part.corner_normal for part in parts])[keep],
+        np.concatenate(texture_id)[keep],
+        tuple(textures),
+        np.repeat([part.roughness for part in parts], counts).astype(np.float32)[keep],
+        np.repeat([part.metallic for part in parts], counts).astype(np.float32)[keep],
+    )
+    rgb = np.concatenate([part.rgb for part in parts])[keep]
+    every = np.arange(len(rgb), dtype=np.int32)
+    mean = np.zeros((len(rgb), 3), np.float64)
+    for weights in _FACE_SAMPLES:
+        mean += surface.sample(every, np.broadcast_to(weights, (len(rgb), 3)), rgb)
+    return surface, np.rint(mean / len(_FACE_SAMPLES)).astype(np.uint8)
+
+
+def _check_extent(corners: Float, name: str, unit_scale: float) -> None:
+    if not np.isfinite(corners).all():
+        raise MeshError(f"CAD model {name}: some vertex coordinates are not finite numbers; repair the file")
+    extent = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
+    low, high = EXTENT_RANGE_M
+    if not low <= extent <= high:
+        raise MeshError(
+            f"CAD model {name}: its largest extent is {extent:.3g} m with unit_scale {unit_scale:g}, expected "
+            f"{low:g} to {high:g} m; set unit_scale to the metres per unit of the file (0.001 for millimetres)"
+        )

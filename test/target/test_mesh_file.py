@@ -1,0 +1,157 @@
+"""Mesh files and target.yaml from others: what is refused, and how."""
+
+import io
+import json
+import struct
+import zipfile
+
+import numpy as np
+import pytest
+import trimesh
+
+from hat_ros.errors import MeshError
+from hat_ros.target.loading import load_target
+
+
+def box(extents=(1.0, 2.0, 3.0)):
+    return trimesh.creation.box(extents)
+
+
+def write_glb(path, document, binary=b""):
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    binary += b"\0" * (-len(binary) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    if binary:
+        chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    path.write_bytes(b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks)
+
+
+def test_target_yaml_names_mesh_scale_and_name(tmp_path):
+    box((100, 200, 300)).export(tmp_path / "box.stl")
+    yaml = tmp_path / "target.yaml"
+    yaml.write_text("mesh: box.stl\nunit_scale: 0.001\nname: crate\n")
+    target = load_target(yaml)
+    assert target.name == "crate"
+    assert target.diameter_m == pytest.approx(0.1 * np.sqrt(14), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("mesh: [", "not valid YAML"),
+        ("- 1", "key 'mesh'"),
+        ("mesh: box.stl\nscale: 2", "unknown key 'scale'"),
+        ("mesh: box.stl\nunit_scale: big", "unit_scale must be a number"),
+        ("mesh: box.stl\nunit_scale: -1", "unit_scale must be a positive number"),
+        ("mesh: ../outside/box.stl", "same folder"),
+        ("mesh: box.zip", "must be one of"),
+        ("mesh: gone.stl", "no such file"),
+    ],
+)
+def test_bad_target_yaml(tmp_path, text, says):
+    box().export(tmp_path / "box.stl")
+    yaml = tmp_path / "target.yaml"
+    yaml.write_text(text)
+    with pytest.raises(MeshError, match=says):
+        load_target(yaml)
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(MeshError, match="no such file"):
+        load_target(tmp_path / "gone.ply")
+
+
+@pytest.mark.parametrize("name", ["model.step", "model.zip", "model.gltf", "model"])
+def test_other_formats_are_refused(tmp_path, name):
+    (tmp_path / name).write_bytes(b"whatever")
+    with pytest.raises(MeshError, match="not supported"):
+        load_target(tmp_path / name)
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "stl", "glb"])
+@pytest.mark.parametrize("content", [b"", b"\0" * 300, b"PK\x03\x04" + b"\0" * 200, bytes(range(256)) * 3])
+def test_random_bytes_are_refused(tmp_path, suffix, content):
+    path = tmp_path / f"noise.{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(MeshError):
+        load_target(path)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "stl", "glb"])
+def test_truncated_files_are_refused(tmp_path, suffix):
+    path = tmp_path / f"cut.{suffix}"
+    box().export(path)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(MeshError):
+        load_target(path)
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "stl", "glb"])
+def test_archive_under_another_name_is_refused(tmp_path, suffix):
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("big.obj", b"0" * 10_000_000)
+    path = tmp_path / f"bomb.{suffix}"
+    path.write_bytes(data.getvalue())
+    with pytest.raises(MeshError):
+        load_target(path)
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "stl", "glb"])
+def test_damaged_bytes_give_a_model_or_a_clear_error(tmp_path, suffix):
+    path, rng = tmp_path / f"m.{suffix}", np.random.default_rng(0)
+    trimesh.creation.icosphere(subdivisions=1).export(path)
+    whole = path.read_bytes()
+    for _ in range(40):
+        data = bytearray(whole)
+        for place in rng.integers(len(data), size=3):
+            data[place] = rng.integers(32, 127)
+        path.write_bytes(data)
+        try:
+            target = load_target(path)
+        except MeshError:
+            continue
+        assert np.isfinite(target.vertices_m).all() and np.isfinite(target.diameter_m)
+
+
+def test_a_file_without_triangles_is_refused(tmp_path):
+    path = tmp_path / "points.ply"
+    trimesh.PointCloud(np.eye(3)).export(path)
+    with pytest.raises(MeshError, match="no triangles"):
+        load_target(path)
+
+
+def test_ply_that_declares_more_than_it_holds_is_refused(tmp_path):
+    path = tmp_path / "bomb.ply"
+    path.write_bytes(
+        b"ply\nformat binary_little_endian 1.0\nelement vertex 99999999999\nproperty float x\n"
+        b"property float y\nproperty float z\nend_header\n"
+    )
+    with pytest.raises(MeshError, match="more than the file can hold"):
+        load_target(path)
+
+
+def test_glb_that_declares_gigabytes_is_refused(tmp_path):
+    path = tmp_path / "bomb.glb"
+    write_glb(
+        path, {"asset": {"version": "2.0"}, "accessors": [{"count": 10**10, "componentType": 5126, "type": "VEC3"}]}
+    )
+    with pytest.raises(MeshError, match="declares"):
+        load_target(path)
+
+
+def test_glb_whose_nodes_share_children_is_refused(tmp_path):
+    nodes = [{"children": [i + 1, i + 1]} for i in range(30)] + [{}]
+    path = tmp_path / "dag.glb"
+    write_glb(path, {"asset": {"version": "2.0"}, "nodes": nodes})
+    with pytest.raises(MeshError, match="not a tree"):
+        load_target(path)
+
+
+@pytest.mark.parametrize("document", [[], {"accessors": [{}]}, {"nodes": [{"children": 3}]}])
+def test_glb_with_malformed_header_is_refused(tmp_path, document):
+    path = tmp_path / "odd.glb"
+    write_glb(path, document)
+    with pytest.raises(MeshError):
+        load_target(path)
