@@ -152,8 +152,8 @@ class Module:
     def optional_members(self) -> int:
         """Attributes of ``self`` that are None at some time."""
         found: set[tuple[int, str]] = set()
-        for owner in ast.walk(self.tree):
-            for node in ast.walk(owner) if isinstance(owner, ast.ClassDef) else ():
+        for owner in (node for node in ast.walk(self.tree) if isinstance(node, ast.ClassDef)):
+            for node in ast.walk(owner):
                 pairs: list[tuple[ast.expr, bool]] = []
                 if isinstance(node, ast.AnnAssign):
                     pairs = [(node.target, bool(re.search(r"\bNone\b|Optional", ast.unparse(node.annotation))))]

@@ -158,7 +158,7 @@ def _attempts(bag: BagReader, masks: bool) -> Iterator[Frame | FrameError]:
 
 
 def _masks(bag: BagReader) -> Iterator[tuple[int, UInt8 | None]]:
-    """Stamps and masks of a bag; one that cannot be decoded says nothing."""
+    """Stamps and masks of a bag; None for one that cannot be decoded."""
     for packet in bag.packets():
         mask = None
         with suppress(FrameError):

@@ -21,7 +21,7 @@ examples:
   hat replay bags/demo --out out/demo          a recorded bag through the five-node ROS graph
   hat track bags/demo --out out/track          the same in this process, no ROS needed
   hat import sequence CLIP --out bags/clip     a folder of images to a bag
-  hat bench CLIP CLIP --out out/bench          every clip, every mode, one table
+  hat bench CLIP CLIP --out out/bench          several methods over several clips, one table
 """
 
 

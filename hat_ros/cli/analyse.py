@@ -22,9 +22,14 @@ def _add_evaluate(commands: Commands) -> None:
         description="Compute the metrics of a result folder again from its bag, rewrite poses.csv, metrics.json and "
         "report.html, and print the main figures.",
     )
-    parser.add_argument("folder", type=Path, metavar="DIR", help="result folder of `hat replay` or `hat track`")
     parser.add_argument(
-        "--truth", type=Path, metavar="BAG", help="recording with the truth (default: the result bag's)"
+        "folder", type=Path, metavar="DIR", help="result folder of `hat replay`, `hat track` or `hat score`"
+    )
+    parser.add_argument(
+        "--truth",
+        type=Path,
+        metavar="BAG",
+        help="recording whose ground truth counts (default: that in the result bag)",
     )
     parser.set_defaults(command=_evaluate)
 
@@ -61,7 +66,7 @@ def _plot(arguments: argparse.Namespace) -> int:
 def _add_score(commands: Commands) -> None:
     parser = commands.add_parser(
         "score",
-        help="poses of a method that is not ours, as a run like any other",
+        help="score the poses of another tracker, as a run like any other",
         description="Score the poses that another tracker (RGBTrack, FoundationPose, your own) made of a recording, "
         "and write a result folder. FILE is TUM (stamp in seconds, x y z qx qy qz qw), or, ending in .csv, BOP "
         "(scene_id,im_id,obj_id,score,R,t,time), or a folder of NUMBER.txt with a 4 x 4 matrix each. Poses map the "

@@ -28,9 +28,15 @@ def _add_run_matrix(parser: argparse.ArgumentParser) -> None:
         metavar="SEQ",
         help="bag or sequence folder, * allowed; SEQ@key=value[,key=value] gives these clips settings of their own",
     )
-    add_dataset(parser)
+    add_dataset(parser, "run over the sequences")
     parser.add_argument("--root", type=Path, metavar="DIR", help="root folder of the --dataset; no bags are written")
-    parser.add_argument("--sequence", action="append", default=[], metavar="NAME", help="only this one (repeatable)")
+    parser.add_argument(
+        "--sequence",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="only this sequence of the data set (repeatable)",
+    )
     parser.add_argument(
         "--suite", type=Path, metavar="DIR", help="all clips that `hat synth suite --out DIR` wrote, with its settings"
     )
@@ -89,12 +95,12 @@ _BENCH_COLUMNS = """\
 columns:
   E_p, E_t, E_q, SD   pose, translation and rotation error: mean and sample standard deviation over scored frames
   >90                 share of scored frames more than 90 degrees off
-  cover               share of frames with truth that got a pose
+  cover               share of frames with ground truth that got a pose
   best<15, best<30    keyframes where the best of the K candidates is within 15 and 30 degrees
   IoU, IoU>.9         overlap of detected and recorded mask: mean, share of frames at 0.9 or better
   rel deg             median rotation error of the motion estimate from frame to frame
-  untrue              share of the frames more than 30 degrees off that call themselves TRACKING
-  in 95%              share of frames whose truth lies inside the stated 95 % ellipsoid
+  false TRACKING      share of the frames more than 30 degrees off that are called TRACKING
+  in 95%              share of frames whose ground truth lies inside the stated 95 % ellipsoid
   fps, p50, p99       frames per second with decoding, latency without; the first ten frames are left out
   cpu ms              processor time per frame without decoding
   MiB, +MiB           peak memory, and its growth from the first to the last quarter of the run
@@ -107,8 +113,8 @@ def _add_bench(commands: Commands) -> None:
         "bench",
         help="clips x methods x masks x starts in one table",
         description="Run methods over clips, each run in a process of its own with one numerical thread, and write\n"
-        "one table as text, CSV, LaTeX, JSON and PNG. Runs that are done already, with the same inputs,\n"
-        "configuration and code, are used again.",
+        "one table as text, CSV, LaTeX and JSON, and its figure as PNG and SVG. Runs that are done already,\n"
+        "with the same inputs, configuration and code, are used again.",
         epilog=_BENCH_COLUMNS,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -149,8 +155,8 @@ def _add_bench(commands: Commands) -> None:
         action="append",
         default=[],
         metavar="NAME=FILE",
-        help="a row for a method that is not ours, from its file of poses (see `hat score`); {clip} in FILE stands for "
-        "the clip's name (repeatable)",
+        help="a row for a method outside this package, from its file of poses (see `hat score`); {clip} in FILE stands "
+        "for the clip's name (repeatable)",
     )
     parser.set_defaults(command=_bench)
 
@@ -202,7 +208,7 @@ tables, each as NAME.txt, .csv, .tex, .json, .png and .svg below --out:
   sensitivity   anchor stride, K, s0, D, w: one setting at a time
   selectors     best appearance, the decoder, the offline backtrace, and a particle filter and a UKF at their best
   filters       the search for that best
-  offline       independent, causal and offline poses from the same observations
+  offline       independent, causal and offline (whole-clip smoothing) poses from the same observations
   by_clip       the same, E_p clip by clip (no figure)
   masks         motion from the masked target and from raw frames
   candidates    best of the K candidates of every image, clip by clip (no figure)
@@ -215,8 +221,8 @@ def _add_ablate(commands: Commands) -> None:
     parser = commands.add_parser(
         "ablate",
         help="component table, sensitivity sweeps, filters, offline reference",
-        description="Run the front ends once per clip, then Stages 3 and 4 over what they saw under every setting of "
-        "the paper's ablations. --config decides the temporal settings; --front-end, if given, takes segmentation, "
+        description="Run the front ends once per clip, then Stages 3 and 4 over what they saw, under every setting of\n"
+        "the paper's ablations. --config decides the temporal settings; --front-end, if given, takes segmentation,\n"
         "hypotheses and motion (and what belongs to its scores) from another preset.",
         epilog=_ABLATE_TABLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,

@@ -27,7 +27,7 @@ STATE_STYLE = {
 
 @contextmanager
 def log_shown(console: Console) -> Iterator[None]:
-    """What takes long says so: log records of this package appear as lines above the bar."""
+    """Log records of this package appear as lines above the bar."""
     log, handler = logging.getLogger("hat_ros"), RichHandler(console=console, show_level=False, show_path=False)
     before = log.level
     log.setLevel(logging.INFO)

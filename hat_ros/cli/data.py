@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hat_ros.cli.options import FORMATS, Commands, natural, positive
+from hat_ros.cli.options import FORMATS, Commands, DefaultsFormatter, natural, positive
 
 if TYPE_CHECKING:
     from hat_ros.bench.synth.suite import Clip
@@ -23,7 +23,7 @@ def _add_import(commands: Commands) -> None:
         "import",
         help="a data set in its own layout to bags",
         description="Read a data set in the layout in which it is published and write one bag per sequence, with "
-        "images, calibration, given masks or boxes, and the truth (for evaluation only). Bags that are complete "
+        "images, calibration, given masks or boxes, and the ground truth (for evaluation only). Bags that are complete "
         "already are left alone.",
     )
     parser.add_argument("format", choices=FORMATS, help="layout of SRC")
@@ -82,10 +82,10 @@ def _import(arguments: argparse.Namespace) -> int:
 def _add_synth(commands: Commands) -> None:
     parser = commands.add_parser(
         "synth",
-        help="a clip rendered from a CAD model, with exact truth",
-        description="Render a tumbling spacecraft in sunlight. WHAT is a CAD file in metres, one of our own models, a "
-        "named clip (its settings are fixed), `suite` (all clips of the synthetic benchmark), or `list`.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        help="a clip rendered from a CAD model, with exact ground truth",
+        description="Render a tumbling spacecraft in sunlight. WHAT is a CAD file in metres, a model of this package, "
+        "a named clip (its settings are fixed), `suite` (all clips of the synthetic benchmark), or `list`.",
+        formatter_class=DefaultsFormatter,
     )
     parser.add_argument("what", metavar="WHAT", help="CAD file, model, clip, `suite` or `list`")
     parser.add_argument("--out", type=Path, metavar="DIR", help="what to write; for `suite` the folder of all bags")
@@ -119,10 +119,10 @@ def _add_synth(commands: Commands) -> None:
     film.add_argument("--stars", type=natural, default=0, metavar="N", help="stars in the field")
     film.add_argument("--background", choices=("black", "earth", "table"), default="black", help="behind the target")
     film.add_argument(
-        "--asymmetry", type=float, default=1.0, metavar="0..1", help="of our own models; 0 makes them ambiguous"
+        "--asymmetry", type=float, default=1.0, metavar="0..1", help="of this package's models; 0 makes them ambiguous"
     )
     film.add_argument(
-        "--panel-turn", type=float, default=0.0, metavar="DEG", help="wings of the spacecraft, not of its CAD, turned"
+        "--panel-turn", type=float, default=0.0, metavar="DEG", help="wings turned against those of the CAD"
     )
     film.add_argument(
         "--recolor", type=float, default=0.0, metavar="0..1", help="colours of the spacecraft differ from its CAD"

@@ -16,13 +16,13 @@ FORMATS = ("sequence", "spark", "shirt", "swisscube", "bop", "ycbv")
 Commands = Any  # argparse's sub-parser action has no public name
 
 
-def add_config(parser: argparse.ArgumentParser, default: str = "default") -> None:
+def add_config(parser: argparse.ArgumentParser) -> None:
     """``--config`` and ``--set``."""
     parser.add_argument(
         "--config",
-        default=default,
+        default="default",
         metavar="NAME|FILE",
-        help=f"preset name or YAML file (default: {default})",
+        help="preset name or YAML file (default: default)",
     )
     add_overrides(parser)
 
@@ -52,14 +52,21 @@ def add_out(parser: argparse.ArgumentParser, what: str) -> None:
     parser.add_argument("--overwrite", action="store_true", help="replace what an earlier run left in DIR")
 
 
-def add_dataset(parser: argparse.ArgumentParser) -> None:
-    """``--dataset``, ``--model`` and ``--detections``."""
+class DefaultsFormatter(argparse.ArgumentDefaultsHelpFormatter):
+    """Shows the default of every option that has one."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        return action.help if action.default in (None, False) else super()._get_help_string(action)
+
+
+def add_dataset(parser: argparse.ArgumentParser, what: str = "the recording is a sequence") -> None:
+    """``--dataset``, ``--model`` and ``--detections``; ``what`` is read from the data set."""
     parser.add_argument(
         "--dataset",
         choices=FORMATS,
         default="",
         metavar="FORMAT",
-        help=f"the recording is a sequence of a data set as published: {', '.join(FORMATS)}",
+        help=f"{what} of a data set as published: {', '.join(FORMATS)}",
     )
     parser.add_argument("--model", type=Path, metavar="CAD", help="metric CAD model, for data sets that bring none")
     parser.add_argument(

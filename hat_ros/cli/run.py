@@ -33,7 +33,7 @@ def _add_replay(commands: Commands) -> None:
     parser = commands.add_parser(
         "replay",
         help="a recorded bag through the five-node ROS graph",
-        description="Play a bag through the real ROS graph without losing a frame, record what it says, and write a "
+        description="Play a bag through the real ROS graph without losing a frame, record its topics, and write a "
         "result folder.",
     )
     parser.add_argument("bag", type=Path, help="bag folder or .mcap file, with the CAD model and target.yaml beside it")
@@ -52,7 +52,7 @@ def _add_replay(commands: Commands) -> None:
         "--domain",
         type=natural,
         metavar="ID",
-        help="ROS domain to play in, so that nodes of your own can listen (default: one that nobody else uses)",
+        help="ROS domain to play in, so that nodes of your own can listen (default: one that is free)",
     )
     add_extent(parser)
     parser.set_defaults(command=_replay)
@@ -91,7 +91,7 @@ def _add_track(commands: Commands) -> None:
         "track",
         help="a recording through the method in this process, no ROS needed",
         description="Run the method over a bag or a sequence folder in this process and write a result folder. "
-        "Gives the same bytes as `hat replay`.",
+        "Gives the same poses as `hat replay`, byte for byte.",
     )
     parser.add_argument("recording", type=Path, help="bag, folder of the `sequence` layout, or root of a data set")
     add_dataset(parser)
@@ -103,9 +103,8 @@ def _add_track(commands: Commands) -> None:
         choices=MODES,
         default="hat",
         help="hat: the paper's method; independent: best hypothesis of every frame; tracking: refine the last pose; "
-        "offline: all frames jointly, not causal; srt3d: region tracker started by the best hypothesis; "
-        "observe: front ends only, candidates at every frame, no poses "
-        "(default: hat)",
+        "offline: all frames jointly (whole-clip smoothing, not causal); srt3d: region tracker started by the best "
+        "hypothesis; observe: front ends only, candidates at every frame, no poses (default: hat)",
     )
     _add_credits(parser, "2, or graph.credits_replay where that is less")
     add_extent(parser)
@@ -134,7 +133,7 @@ def _track(arguments: argparse.Namespace) -> int:
 def _add_temporal(commands: Commands) -> None:
     parser = commands.add_parser(
         "temporal",
-        help="stages 3 and 4 alone over recorded observations",
+        help="selection and fusion alone (stages 3 and 4) over recorded observations",
         description="Run selection, alignment and fusion over an .npz file with slam (N,4,4) T_slam_cam (NaN = none), "
         "key (N,) bool, poses (N,K,4,4) T_cam_target, scores (N,K) and optionally box_area_px (N,). "
         "Writes T_cam_target (N,4,4), chosen (N,), accepted (N,) and resets.",

@@ -74,9 +74,9 @@ def _weights(arguments: argparse.Namespace) -> int:
 def _add_doctor(commands: Commands) -> None:
     parser = commands.add_parser(
         "doctor",
-        help="is everything here that a run needs?",
+        help="check that what a run needs is installed and works",
         description="Check Python, packages, ROS, DDS, renderer, presets, cache and weights; exit code 1 if something "
-        "that the default preset needs is missing.",
+        "that `hat track` or `hat replay` needs is missing.",
     )
     parser.set_defaults(command=_doctor)
 
@@ -103,14 +103,14 @@ def _add_profile(commands: Commands) -> None:
     parser = commands.add_parser(
         "profile",
         help="network passes, renders, time and memory per keyframe",
-        description="Run HAT over a recording, count every network pass and render, and time every part: per keyframe, "
-        "per frame between keyframes, and once at the start (weights, templates, first keyframe). Stages run one after "
-        "another; `hat bench --modes hat,graph` measures them overlapped.",
+        description="Run HAT over a recording, count every network pass and render, and time stages and networks: per "
+        "keyframe, per frame between keyframes, and once at the start (weights, templates, first keyframe). Stages run "
+        "one after another; `hat bench --modes hat,graph` measures them overlapped.",
     )
     parser.add_argument("recording", type=Path, help="bag, folder of the `sequence` layout, or root of a data set")
     add_dataset(parser)
     parser.add_argument("--sequence", default="", metavar="NAME", help="which sequence of the data set")
-    add_config(parser, "mega_hat")
+    add_config(parser)
     parser.add_argument("--limit", type=positive, metavar="N", help="at most N frames (default: all)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there as well")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")

@@ -76,7 +76,7 @@ def test_a_steady_target_under_noisy_motion_is_tracked_better(name, gap):
     on = replace(off, fusion=replace(off.fusion, inertial_weight=off.fusion.relative_weight))
     turn_deg, shift_m = ({"off": [], "on": []} for _ in range(2))
     for seed in range(2):
-        scene = make_scene(140, gap=gap, seed=seed, noise_deg=0.5, rival_score=0.3)
+        scene = make_scene(140, gap=gap, seed=seed, noise_deg=0.5, competing_score=0.3)
         observations = _shaky(scene, seed)
         for label, config in (("off", off), ("on", on)):
             T = run_temporal(observations, config).T_cam_target[30:]

@@ -63,10 +63,10 @@ class NoSlam(KnowingSlam):
         return Motion.none()
 
 
-seen_in_hindsight: list[tuple[int, int]] = []
+seen_whole_clip: list[tuple[int, int]] = []
 
 
-def knowing_in_hindsight(config, clip) -> list[Motion]:
+def knowing_whole_clip(config, clip) -> list[Motion]:
     """The right motion of a whole clip; notes each stamp and the brightest pixel beside the mask."""
-    seen_in_hindsight[:] = [(frame.stamp_ns, int(frame.rgb[~detection.mask].max())) for frame, detection in clip]
+    seen_whole_clip[:] = [(frame.stamp_ns, int(frame.rgb[~detection.mask].max())) for frame, detection in clip]
     return [KnowingSlam(config, None).update(frame, detection, None) for frame, detection in clip]

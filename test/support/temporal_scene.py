@@ -26,10 +26,10 @@ def make_scene(
     noise_m=0.03,
     rate_deg=1.0,
     scale=2.5,
-    rival_score=0.7,
+    competing_score=0.7,
     gauge=None,
 ):
-    """Observations whose candidates are the truth, its half-turned rival and random poses, each with noise."""
+    """Observations whose candidates are the true pose, its half-turned competitor and random poses, all with noise."""
     rng = np.random.default_rng(seed)
     axis = np.array([0.3, 1.0, 0.2]) / np.linalg.norm([0.3, 1.0, 0.2])
     R0 = lie.so3_exp(rng.normal(size=3))
@@ -47,7 +47,7 @@ def make_scene(
             basin = (np.eye(3), HALF_TURN)[j] if j < 2 else lie.so3_exp(rng.normal(size=3) * 2)
             noisy = lie.so3_exp(np.radians(noise_deg) * rng.normal(size=3)) @ R[i] @ basin
             poses[i, j] = lie.transform(noisy, t[i] + noise_m * rng.normal(size=3))
-            scores[i, j] = (0.8, rival_score, 0.5, 0.45, 0.4, *[0.3] * 60)[j] + 0.08 * rng.normal()
+            scores[i, j] = (0.8, competing_score, 0.5, 0.45, 0.4, *[0.3] * 60)[j] + 0.08 * rng.normal()
         order = rng.permutation(k)
         poses[i], scores[i] = poses[i, order], np.abs(scores[i, order]) + 1e-3
     area = (600.0 / t[:, 2]) ** 2

@@ -44,7 +44,7 @@ def open_bop(
         root: the data set's folder.
         model: unused here: the models come with the data set.
         sequences: names ``SCENE`` or ``SCENE_objID`` to keep, empty = all.
-        targets_only: keep truth only at the images that ``test_targets_bop19.json`` lists, the published targets.
+        targets_only: keep ground truth only at the published targets (``test_targets_bop19.json``).
         without: object ids that are left out.
 
     Raises:
@@ -73,7 +73,7 @@ def open_bop(
 
 
 def open_ycbv(root: Path, model: Path | None = None, sequences: Collection[str] = ()) -> Iterator[ImageRecording]:
-    """YCB-Video as the paper scores it: whole videos, truth at the BOP-19 targets of the non-symmetric objects alone.
+    """YCB-Video as the paper scores it: whole videos, ground truth at the BOP-19 targets of non-symmetric objects.
 
     Arguments and errors as of :func:`open_bop`; objects of a scene without any target are left out.
     """

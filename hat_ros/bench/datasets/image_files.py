@@ -31,7 +31,7 @@ class ImageFile:
     Attributes:
         stamp_ns: exposure stamp.
         image: 8-bit colour or grey image file.
-        T_cam_target: (4, 4) truth, None when unknown.
+        T_cam_target: (4, 4) ground truth, None when unknown.
         masks: image files of the target's visible silhouette (> 127 inside), joined; empty = none given.
         box_xyxy: (4,) detection box in pixels of the undistorted image, used when there is no mask; None = none.
     """

@@ -264,11 +264,11 @@ def check_picture(recording: ImageRecording, width_px: int = 640) -> UInt8:
     model shows in the row below, which must look like the row above but for the light.
 
     Raises:
-        DatasetError: the recording has no truth.
+        DatasetError: the recording has no ground truth.
     """
     labelled = [(item, T) for item in recording.files if (T := item.T_cam_target) is not None]
     if not labelled:
-        raise DatasetError(f"{recording.name}: no frame has a true pose, nothing to check")
+        raise DatasetError(f"{recording.name}: no frame has a ground truth, nothing to check")
     renderer = create_renderer("rays", load_target(recording.target_path, recording.unit_scale))
     columns = []
     for item, T_cam_target in (labelled[0], labelled[len(labelled) // 2], labelled[-1]):

@@ -34,7 +34,7 @@ def seconds(log: RunLog) -> Float:
 
 
 def error_figure(log: RunLog) -> Figure:
-    """Errors over time with keyframes, anchors, resets and states marked; the poses themselves without truth."""
+    """Errors over time with keyframes, anchors, resets and states marked; without ground truth the poses."""
     if not log.has_truth.any():
         return pose_figure(log)
     errors = metrics.pose_errors(log.T_est, log.T_true)
@@ -101,7 +101,7 @@ def range_figure(bins: list[dict[str, float]]) -> Figure:
             middle, [b[f"{key}_q25"] for b in bins], [b[f"{key}_q75"] for b in bins], color="#7f9fc8", alpha=0.4
         )
         axis.plot(middle, [b[f"{key}_median"] for b in bins], "o-", color="#20406a", markersize=4)
-        axis.set_xlabel("true depth (m)")
+        axis.set_xlabel("depth, ground truth (m)")
         axis.set_ylabel(label)
         axis.grid(True, alpha=0.3)
     axes[1].axhline(0, color="#999999", linewidth=0.6)

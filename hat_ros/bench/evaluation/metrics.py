@@ -1,8 +1,8 @@
 """The figures of the paper's evaluation and the diagnostics around them: pure functions of arrays.
 
 Conventions: N frames in order; poses are ``T_cam_target`` (N, 4, 4) in metres, NaN where there is no output or no
-truth. A missing output lowers the coverage and is never an error of zero; means, standard deviations (ddof = 1) and
-shares are taken over the frames that have both. A figure that has no data is NaN here and null in JSON.
+ground truth. A missing output lowers the coverage and is never an error of zero; means, standard deviations (ddof = 1)
+and shares are taken over the frames that have both. A figure that has no data is NaN here and null in JSON.
 
 Sources: E_t, E_q, E_p are the equations of the paper's section "Experimental Setup and Evaluation Metric"; ADD-S
 after Xiang et al., PoseCNN (RSS 2018), section V-C; range bins after the paper's "Range-Dependent Rotation and Depth
@@ -26,12 +26,12 @@ from hat_ros.types import TrackState
 # A rotation further off than this lies in another orientation basin (paper: the share above 90 degrees).
 WRONG_BASIN_DEG = 90.0
 # An output further off than this must not be called TRACKING.
-UNTRUE_DEG = 30.0
+FALSE_TRACKING_DEG = 30.0
 
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """Errors per frame; NaN where the output or the truth is missing.
+    """Errors per frame; NaN where the output or the ground truth is missing.
 
     Attributes:
         translation_m: (N,) E_t.
@@ -45,7 +45,7 @@ class PoseErrors:
 
     @property
     def scored(self) -> Bool:
-        """(N,) frames with both an output and a truth."""
+        """(N,) frames with both an output and a ground truth."""
         return np.isfinite(self.pose)
 
 
@@ -95,7 +95,7 @@ def summarise(errors: PoseErrors) -> dict[str, float]:
 
 
 def coverage(has_output: Bool, has_truth: Bool) -> dict[str, Any]:
-    """Targets, valid outputs and their share; the targets are the frames with truth, or all frames without any."""
+    """Targets, valid outputs and their share; targets are the frames with ground truth, or all if there is none."""
     targets = has_truth if has_truth.any() else np.ones(len(has_output), dtype=bool)
     valid = int(np.count_nonzero(has_output & targets))
     n_targets = int(np.count_nonzero(targets))
@@ -108,10 +108,10 @@ def add_s(points: Float, T_est: Float, T_true: Float) -> Float:
     Args:
         points: (P, 3) points of the CAD surface, target frame, metres.
         T_est: (N, 4, 4) outputs.
-        T_true: (N, 4, 4) truth.
+        T_true: (N, 4, 4) ground truth.
 
     Returns:
-        (N,) metres, NaN where output or truth is missing.
+        (N,) metres, NaN where output or ground truth is missing.
     """
     out = np.full(len(T_est), np.nan)
     tree = cKDTree(points)
@@ -129,7 +129,7 @@ def best_of_k_deg(candidates: Sequence[Float], T_true: Float) -> Float:
         T_true: (N, 4, 4).
 
     Returns:
-        (N,) degrees; NaN without truth, and 180 (nothing could be worse) where truth exists but no candidate does.
+        (N,) degrees; NaN without ground truth, and 180 (nothing could be worse) where it exists but no candidate does.
     """
     out = np.full(len(candidates), np.nan)
     for i, rows in enumerate(candidates):
@@ -158,7 +158,7 @@ def range_bins(T_est: Float, T_true: Float, width_m: float = 2.0) -> list[dict[s
 
     Args:
         T_est: (N, 4, 4) outputs.
-        T_true: (N, 4, 4) truth.
+        T_true: (N, 4, 4) ground truth.
         width_m: bin width in metres.
 
     Returns:
@@ -201,12 +201,14 @@ def depth_energy_share(T_est: Float, T_true: Float) -> float:
 
 
 def inside_ellipsoid(T_est: Float, covariance: Float, T_true: Float, probability: float = 0.95) -> Bool:
-    """Whether the truth lies inside the stated confidence ellipsoid; frames without covariance or truth are left out.
+    """Whether the ground truth lies inside the stated confidence ellipsoid.
+
+    Frames without covariance or ground truth are left out.
 
     Args:
         T_est: (N, 4, 4) outputs.
         covariance: (N, 6, 6) of ``[translation; rotation vector]`` with ``R_true = Exp(rotvec) R_est``.
-        T_true: (N, 4, 4) truth.
+        T_true: (N, 4, 4) ground truth.
         probability: mass of the ellipsoid.
 
     Returns:
@@ -231,8 +233,8 @@ def inside_ellipsoid(T_est: Float, covariance: Float, T_true: Float, probability
     return np.array(inside, dtype=bool)
 
 
-def untrue_tracking_share(states: Int, errors: PoseErrors, limit_deg: float = UNTRUE_DEG) -> float:
-    """Share of the frames more than ``limit_deg`` off that call themselves TRACKING; NaN if there is no such frame."""
+def untrue_tracking_share(states: Int, errors: PoseErrors, limit_deg: float = FALSE_TRACKING_DEG) -> float:
+    """Share of the frames more than ``limit_deg`` off that are called TRACKING; NaN if there is no such frame."""
     far = errors.scored & (np.degrees(np.nan_to_num(errors.rotation_rad)) > limit_deg)
     return _share(states[far] == TrackState.TRACKING)
 

@@ -72,15 +72,15 @@ def complete_folder(folder: Path, source: Source | None, measured: dict[str, Any
 
 
 def evaluate_folder(folder: Path, truth: Path | None = None) -> None:
-    """Score a finished run again, perhaps against another truth, and rewrite tables, metrics and report.
+    """Score a finished run again, perhaps against another ground truth, and rewrite tables, metrics and report.
 
     Args:
         folder: result folder; what the run itself measured is kept from its ``metrics.json``.
-        truth: recording whose truth counts; by default the one that is in the result bag.
+        truth: recording whose ground truth counts; by default that in the result bag.
 
     Raises:
         UsageError: it is no result folder.
-        BagError: a bag is damaged, or the recording has no truth for these frames.
+        BagError: a bag is damaged, or the recording has no ground truth for these frames.
     """
     run, figures, _ = read_folder(folder)
     log = read_result_bag(folder / BAG_FOLDER)
@@ -89,7 +89,7 @@ def evaluate_folder(folder: Path, truth: Path | None = None) -> None:
         first, last = int(log.stamp_ns[0]), int(log.stamp_ns[-1])
         log = log.with_truth({stamp: row for stamp, row in source.truth_rows().items() if first <= stamp <= last})
         if not log.has_truth.any():
-            raise BagError(f"{truth} has no true pose at any stamp of {folder}: is it the recording of this run?")
+            raise BagError(f"{truth} has no ground truth at any stamp of {folder}: is it the recording of this run?")
     figures |= score_run(log, source.target if source else None)
     write_tables(folder, log)
     write_json(folder / METRICS_FILE, figures)

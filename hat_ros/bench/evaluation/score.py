@@ -1,4 +1,4 @@
-"""The figures of ``metrics.json``, from a run and its truth."""
+"""The figures of ``metrics.json``, from a run and its ground truth."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ADD_S_POINTS = 1000
 
 
 def score_run(log: RunLog, target: Target | None = None) -> dict[str, Any]:
-    """Every figure that a run and its truth give (DESIGN section 6); without truth the errors are NaN.
+    """Every figure that a run and its ground truth give; without ground truth the errors are NaN.
 
     Args:
         log: the run.

@@ -95,7 +95,7 @@ def plan(
     """Merge the configurations, write the result to ``out/config.yaml``, and list the runs of the front ends.
 
     Args:
-        clips: recordings with truth, each with settings of its own for the front ends.
+        clips: recordings with ground truth, each with settings of its own for the front ends.
         out: folder of the runs.
         config: preset or file of the temporal settings.
         front_end: preset or file of segmentation, hypotheses and motion, and of what belongs to its scores
@@ -189,7 +189,9 @@ def tables(plan: Plan, outcomes: Sequence[Outcome]) -> dict[str, Table]:
         "sensitivity": table_of("Sensitivity, one setting at a time", rows["sensitivity"], observed),
         "selectors": with_best_filters(table_of("Selection at keyframes", rows["selectors"], observed), filters),
         "filters": filters,
-        "offline": table_of("Causal and offline on the same observations", rows["offline"], observed),
+        "offline": table_of(
+            "Causal, and offline (whole-clip smoothing), on the same observations", rows["offline"], observed
+        ),
         "by_clip": clip_table(rows["offline"], clips),
         "masks": Table("Background masking of the motion estimate", _COLUMNS, masks),
         "candidates": candidate_table(clips),
@@ -213,7 +215,7 @@ def trace(plan: Plan, outcomes: Sequence[Outcome]) -> dict[str, Any]:
 
 
 def with_best_filters(selectors: Table, filters: Table) -> Table:
-    """The table of selectors with the one setting of each filter whose anchors are closest to the truth."""
+    """The table of selectors with the one setting of each filter whose anchors are closest to the ground truth."""
     best: dict[str, dict[str, Any]] = {}
     for row in filters.rows:
         kind = row["name"].split(",")[0]

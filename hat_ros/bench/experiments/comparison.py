@@ -1,4 +1,4 @@
-"""``hat bench``: clips x methods x masks x starts in one table, so that the failing stage is visible at a glance."""
+"""``hat bench``: clips x methods x masks x starts in one table, so that the failing stage shows."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _FIGURES = (
     Column("mask_iou_mean", "IoU", ".3f"),
     Column("mask_iou_over_0_9_share", "IoU>.9", ".1%"),
     Column("relative_motion_deg_median", "rel deg", ".3f"),
-    Column("untrue_tracking_share", "untrue", ".1%"),
+    Column("untrue_tracking_share", "false TRACKING", ".1%"),
     Column("inside_95_share", "in 95%", ".1%"),
     Column("fps", "fps", ".1f"),
     Column("latency_ms_p50", "p50 ms", ".1f"),
@@ -210,7 +210,7 @@ def _labels(spec: SourceSpec, masks: str, start: int, name: str) -> dict[str, st
 
 
 def bench_table(outcomes: Sequence[Outcome]) -> Table:
-    """Accuracy, recall, masks, motion, honesty, speed and memory of every run."""
+    """Accuracy, recall, masks, motion, stated confidence, speed and memory of every run."""
     return Table("Benchmark", (*_WHERE, *_FIGURES, Column("run", "run")), _rows(outcomes))
 
 

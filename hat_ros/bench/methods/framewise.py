@@ -115,7 +115,7 @@ class _LastPose:
 
 
 class Observe:
-    """What the front ends see when nobody asks for a pose: candidates at every frame, motion, no priors."""
+    """The front ends alone: candidates at every frame, motion, no priors and no pose."""
 
     causal = True
     concurrent = True
@@ -127,7 +127,7 @@ class Observe:
         self._motion = wrap("motion", MotionStage(config, target))
 
     def step(self, frame: Frame) -> Step:
-        """Look, and say nothing."""
+        """Observe one image; no pose."""
         detection = self._segmentation.update(frame, None)
         motion = self._motion.update(frame, detection, None)
         candidates = self._hypotheses.update(frame, detection, None)

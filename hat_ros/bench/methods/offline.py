@@ -1,7 +1,7 @@
-"""The offline reference: what hindsight makes of the observations of HAT. Never causal.
+"""The offline reference: the observations of HAT, smoothed over the whole clip. Never causal.
 
 After the paper's "Causal and Offline Performance Comparison": motion by global bundle adjustment where the backend can
-(DROID-SLAM), the decoder's path traced back, one verdict of the gate over the whole sequence, all poses optimised
+(DROID-SLAM), the decoder's path traced back, one decision of the gate over the whole sequence, all poses optimised
 jointly, then dense refinement of every frame, which never leaves the basin of the anchors. Here the refined poses are
 measurements, as they are for the causal method: a last joint optimisation ties them to each other by the motion.
 Without refinement in the configuration the poses of the anchors stand.
@@ -87,7 +87,7 @@ class Offline:
         return estimates
 
     def _motions(self) -> list[Motion]:
-        """By hindsight where the backend has any; not for a clip on which it never got going."""
+        """Adjusted over the whole clip where the backend can; not for a clip on which it never started."""
         causal = [step.motion for step in self._steps]
         if self._offline_motions is None or not any(motion.valid for motion in causal):
             return causal
@@ -96,7 +96,7 @@ class Offline:
     def _best_known(self, T_decided: Float, tied: Bool) -> Float:
         """Poses (N, 4, 4): the decided ones, and the causal ones where no motion ties the decided to other frames.
 
-        There hindsight knows no more than the causal method did.
+        There the whole clip tells no more than the frames before did.
         """
         out = T_decided.copy()
         for index in np.flatnonzero(~tied):

@@ -1,9 +1,10 @@
-"""The paper's offline reference for Stages 3 and 4: what hindsight would have answered. Never causal.
+"""The paper's offline reference for Stages 3 and 4: whole-clip smoothing. Never causal.
 
 Over recorded observations of a whole sequence: the decoder's path is traced back from its end, the running gate becomes
-one verdict over all keyframes, each SLAM epoch is aligned once to its anchors, and the poses of all frames are
+one decision over all keyframes, each SLAM epoch is aligned once to its anchors, and the poses of all frames are
 optimised together. The causal gate weakens an anchor that disagrees with the motion because it cannot know which of
-the two is wrong; hindsight can, so an anchor that does not fit the others counts for nothing (:func:`consistent`).
+the two is wrong; over the whole clip that shows, so an anchor that does not fit the others counts for nothing
+(:func:`consistent`).
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _MAD_TO_SIGMA = 1.4826
 
 @dataclass(frozen=True)
 class Smoothed:
-    """Hindsight for N frames.
+    """The smoothed answer for N frames.
 
     Attributes:
         T_cam_target: (N, 4, 4) poses; NaN only when there is no anchor at all.

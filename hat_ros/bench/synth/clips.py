@@ -1,4 +1,4 @@
-"""``hat synth``: a clip of any CAD model, with exact truth, written in the ``sequence`` layout."""
+"""``hat synth``: a clip of any CAD model, with exact ground truth, written in the ``sequence`` layout."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class SynthFrame:
     Attributes:
         rgb: (H, W, 3) uint8.
         mask: (H, W) bool visible target, by the rays through the pixel centres.
-        T_cam_target: (4, 4) truth.
+        T_cam_target: (4, 4) ground truth.
     """
 
     rgb: UInt8

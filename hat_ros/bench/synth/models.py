@@ -1,4 +1,4 @@
-"""Spacecraft models of the project's own making, so that tests, demo and benchmark need nobody else's files.
+"""Spacecraft models of the project's own making, so that tests, demo and benchmark need no files of others.
 
 All are in metres, z up along the body's long axis, wings along y. They are built from boxes and turned parts with
 drawn textures; :func:`build_model` gives the scene, :func:`write_model` a GLB file.

@@ -1,4 +1,4 @@
-"""The report contains what it promises, in one file, with and without truth."""
+"""The report contains what it promises, in one file, with and without ground truth."""
 
 import json
 import re

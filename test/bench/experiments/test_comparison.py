@@ -125,7 +125,7 @@ def test_two_methods_of_one_name_are_refused(clips):
 
 
 def test_suite_clips_come_with_the_settings_of_their_group(tmp_path):
-    for group, name in (("ycbv", "ycbv_probe"), ("spark", "spark_observer"), ("spark", "a_stranger")):
+    for group, name in (("ycbv", "ycbv_probe"), ("spark", "spark_observer"), ("spark", "of_no_suite")):
         (tmp_path / group / name).mkdir(parents=True)
     named = clips_of_suite(tmp_path)
     assert [spec.name for spec, _ in named] == ["spark_observer", "ycbv_probe"]

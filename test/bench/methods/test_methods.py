@@ -130,7 +130,7 @@ def test_offline_answers_at_the_end_for_every_frame(frames, target):
     assert not method.causal
     final = method.finish()
     assert [e.stamp_ns for e in final] == [s.estimate.stamp_ns for s in steps]
-    assert (errors_deg(final) < 2.0).all(), "hindsight also corrects the frames of the warm-up"
+    assert (errors_deg(final) < 2.0).all(), "smoothing also corrects the frames of the warm-up"
 
 
 def test_offline_refines_on_the_images_where_the_configuration_does(frames, target):
@@ -139,7 +139,7 @@ def test_offline_refines_on_the_images_where_the_configuration_does(frames, targ
     assert all(np.isfinite(e.covariance).all() for e in final), "a refined pose knows its uncertainty"
 
 
-def test_hindsight_loses_to_the_causal_pose_nowhere_that_matters(frames, target):
+def test_whole_clip_smoothing_is_on_average_no_worse_than_the_causal_poses(frames, target):
     steps, method = run("offline", frames, target, refinement={"enabled": True})
     causal_deg, offline_deg = errors_deg([step.estimate for step in steps]), errors_deg(method.finish())
     assert offline_deg.mean() <= causal_deg.mean()
@@ -152,13 +152,13 @@ def test_offline_leaves_the_causal_pose_where_an_anchor_stands_alone(frames, tar
     assert offline_deg.mean() <= causal_deg.mean() + 1e-9
 
 
-def test_offline_takes_the_motion_of_hindsight_where_the_backend_has_one(frames, target, monkeypatch):
-    monkeypatch.setitem(OFFLINE_MOTIONS, "knowing", "scripted_backends:knowing_in_hindsight")
+def test_offline_takes_the_motion_of_the_whole_clip_where_the_backend_has_one(frames, target, monkeypatch):
+    monkeypatch.setitem(OFFLINE_MOTIONS, "knowing", "scripted_backends:knowing_whole_clip")
     monkeypatch.setitem(BACKENDS["slam"], "knowing", "scripted_backends:ReversedSlam")
     steps, method = run("offline", frames, target, slam={"backend": "knowing"})
     assert errors_deg([step.estimate for step in steps][6:]).max() > 5.0, "reversed motion misleads the causal pose"
     assert (errors_deg(method.finish()) < 2.0).all()
-    assert scripted_backends.seen_in_hindsight == [(frame.stamp_ns, 0) for frame in frames], "background suppressed"
+    assert scripted_backends.seen_whole_clip == [(frame.stamp_ns, 0) for frame in frames], "background suppressed"
 
 
 def test_offline_of_nothing_is_nothing(target):

@@ -44,11 +44,11 @@ def test_the_path_is_the_best_of_all_paths(seed):
     assert backtrace(candidates, motions, config)[keys].tolist() == list(best)
 
 
-def test_the_gate_is_one_verdict_over_the_whole_sequence():
-    scene = make_scene(60, k=3, rival_score=0.3)
+def test_the_gate_is_one_decision_over_the_whole_sequence():
+    scene = make_scene(60, k=3, competing_score=0.3)
     candidates, motions = _recorded(scene)
     keys = np.flatnonzero(scene.observations.key)
-    # Nobody supports anybody: the median count is one, so every keyframe takes its best appearance.
+    # No candidate supports another: the median count is one, so every keyframe takes its best appearance.
     chosen = backtrace(candidates, motions, replace(PUBLISHED, running_gate=True, gate_neighbourhood_deg=0.001))
     np.testing.assert_array_equal(chosen[keys], np.argmax(scene.observations.scores[keys], axis=1))
 
@@ -64,7 +64,7 @@ def test_keyframes_without_survivors_are_passed_over():
 
 
 @pytest.mark.parametrize("name", ["mega_hat", "pico_hat", "mega_hat_spark"])
-def test_hindsight_is_no_worse_than_causal(name):
+def test_smoothing_is_no_worse_than_causal(name):
     config, causal_deg, offline_deg = preset(name), [], []
     for seed in range(3):
         scene = make_scene(160, seed=seed, noise_deg=4)
@@ -149,7 +149,7 @@ class TestConsistent:
         assert consistent(anchors, motions, self.CONFIG).tolist() == [True]
 
     def test_what_was_left_out_is_said(self):
-        scene = make_scene(60, k=2, gap=4, noise_deg=1, rival_score=0.1)
+        scene = make_scene(60, k=2, gap=4, noise_deg=1, competing_score=0.1)
         candidates, motions = _recorded(scene)
         T = candidates[20].T_cam_target[0]
         flipped = lie.transform(scene.T_cam_target[20, :3, :3] @ HALF_TURN, T[:3, 3])

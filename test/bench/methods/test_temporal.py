@@ -27,7 +27,7 @@ def _changed(observations, **arrays):
 
 def _perfect(n=60, **options):
     """No noise: the anchors that are right are exact, and so must every fused pose be."""
-    scene = make_scene(n, noise_deg=0, noise_m=0, rival_score=0.1, **options)
+    scene = make_scene(n, noise_deg=0, noise_m=0, competing_score=0.1, **options)
     return scene.T_cam_target, scene.observations
 
 
@@ -167,7 +167,7 @@ class TestSchedule:
         assert np.flatnonzero(result.held[13:]).tolist() == [30 - 13, 31 - 13, 33 - 13, 34 - 13, 35 - 13, 37 - 13]
 
     def test_after_a_gap_the_aligned_slam_pose_takes_over(self):
-        """Noise-free anchors until the gap: there the aligned SLAM pose is the truth."""
+        """Noise-free anchors until the gap: there the aligned SLAM pose is exact."""
         T, observations = _perfect(60)
         slam, key = observations.slam.copy(), observations.key.copy()
         slam[30:33], key[30:] = np.nan, False
@@ -219,7 +219,7 @@ class TestReset:
             poses[key, :, :3, :3] = T[key, :3, :3] @ turns[i % 3]
         assert run_temporal(_changed(o, poses=poses), preset()).resets.tolist() == []
 
-    def test_rival_anchors_are_weakened_not_followed(self):
+    def test_dissenting_anchors_are_weakened_not_followed(self):
         T, o = _perfect(100, k=1)
         poses = o.poses.copy()
         poses[40, :, :3, :3] = T[40, :3, :3] @ HALF_TURN
@@ -262,7 +262,7 @@ class TestGuardInTheLoop:
 def test_opposite_ends_of_the_half_turn_are_no_trouble():
     """A target at almost 180 degrees all along: no jump of the sign or of the angle."""
     gauge = lie.transform(HALF_TURN, np.zeros(3))
-    scene = make_scene(60, noise_deg=0, noise_m=0, rival_score=0.1, gauge=gauge, rate_deg=0.01)
+    scene = make_scene(60, noise_deg=0, noise_m=0, competing_score=0.1, gauge=gauge, rate_deg=0.01)
     result = run_temporal(scene.observations, preset())
     np.testing.assert_allclose(result.T_cam_target[12:], scene.T_cam_target[12:], atol=1e-9)
 

@@ -76,7 +76,7 @@ def test_errors_are_those_of_a_run_of_ours(bag, tmp_path):
     assert figures(folder) == before
 
 
-def test_stamps_that_lost_their_last_digits_still_match_and_strangers_do_not():
+def test_stamps_that_lost_their_last_digits_still_match_and_others_do_not():
     rows = {stamp(0) + 400: np.ones(7), stamp(1) - 900_000: np.full(7, 2.0), stamp(1): np.full(7, 3.0)}
     rows |= {stamp(3) + 2_000_000: np.full(7, 4.0)}
     matched = match_stamps([stamp(i) for i in range(4)], rows)

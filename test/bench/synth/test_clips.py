@@ -1,4 +1,4 @@
-"""Synthetic clips: truth, determinism, models, mismatch, suite."""
+"""Synthetic clips: ground truth, determinism, models, mismatch, suite."""
 
 from dataclasses import replace
 
