@@ -214,8 +214,14 @@ def node_table() -> str:
     return "\n".join(rows)
 
 
+def room_order() -> str:
+    """The rooms of the package from the ground up, as the test of imports has them."""
+    floors = _literal(ROOT / "test" / "test_rooms.py", "FLOORS")
+    return "\n".join(f"{n}. {', '.join(f'`{room}`' for room in rooms)}" for n, rooms in enumerate(floors, 1))
+
+
 def _literal(path: Path, name: str) -> Any:
-    """A constant of a module that cannot be imported without ROS."""
+    """A constant of a module that cannot be imported here."""
     for node in ast.parse(path.read_text(encoding="utf-8")).body:
         if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
@@ -232,6 +238,7 @@ GENERATORS: dict[str, Callable[[], str]] = {
     "weights": weight_table,
     "launch": launch_table,
     "nodes": node_table,
+    "rooms": room_order,
     "n_parameters": lambda: str(len(flat_options())),
     "n_sections": lambda: str(len(config_to_dict(HatConfig()))),
 }

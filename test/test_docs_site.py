@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+import hat_ros
 from hat_ros.config import flat_options
 from hat_ros.io import topics
 
@@ -118,6 +119,12 @@ def test_site_fetches_nothing():
     text = read(ROOT / "mkdocs.yml")
     assert "font: false" in text
     assert "http" not in text
+
+
+def test_every_public_name_is_on_the_library_page():
+    page = read(ROOT / "docs" / "library.md")
+    named = {line.rsplit(".", 1)[1] for line in page.splitlines() if line.startswith("::: hat_ros.")}
+    assert set(hat_ros.__all__) <= named
 
 
 def test_readme_stays_short():
