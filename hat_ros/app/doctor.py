@@ -113,7 +113,7 @@ def _numbers(version: str) -> tuple[int, ...]:
 
 
 def installed_version(package: str) -> str | None:
-    """Version of an installed package; OpenCV from apt or from source says it only itself."""
+    """Version of an installed package; OpenCV from apt or from source has it in its module alone."""
     version = _version(package)
     if version is None and package == "opencv-python-headless" and find_spec("cv2") is not None:
         import cv2

@@ -1,4 +1,4 @@
-"""The estimate drawn into the image: CAD outline, axes of the target frame, state. For people, and for the report."""
+"""The estimate drawn into the image, for viewers, reports and videos: CAD outline, axes of the target frame, state."""
 
 from __future__ import annotations
 

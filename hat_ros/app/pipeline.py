@@ -24,10 +24,10 @@ from hat_ros.types import Estimate, Frame
 
 @dataclass(frozen=True)
 class Processed:
-    """One admitted frame and what came of it.
+    """One admitted frame and its answers.
 
     Attributes:
-        step: what the stages said.
+        step: the answers of the stages.
         latency_ms: wall time from admission to the answer, waiting behind frames in flight included.
         decode_ms: wall time of reading and decoding the frame before that, beside earlier frames.
         stage_ms: wall time by stage, waiting left out.

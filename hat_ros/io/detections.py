@@ -1,6 +1,6 @@
 """Detections computed elsewhere and shipped beside a recording, for importers to turn into ``Frame.given_mask``.
 
-Three layouts are understood, told apart by what is found, never by a guess at a name:
+Three layouts are understood, distinguished by their content, never by file names:
 
 * a JSON list in the style of the BOP challenge and CNOS: ``{"image_id": int or file name, "score": float, ...}`` with
   ``segmentation`` (COCO run lengths, ``{"size": [H, W], "counts": [...] or compressed string}``) and/or ``bbox``
@@ -225,7 +225,7 @@ def decode_rle(segmentation: Any, where: str = "segmentation") -> Mask:
     if not isinstance(counts, list) or not all(type(v) is int and v >= 0 for v in counts):
         raise DatasetError(f"{where}: run lengths must be non-negative integers")
     if sum(counts) != size[0] * size[1]:
-        raise DatasetError(f"{where}: run lengths add up to {sum(counts)} px, the size says {size[0] * size[1]}")
+        raise DatasetError(f"{where}: run lengths add up to {sum(counts)} px, the size needs {size[0] * size[1]}")
     values = np.zeros(len(counts), np.uint8)
     values[1::2] = MASK_SILHOUETTE
     return np.ascontiguousarray(np.repeat(values, counts).reshape(size[1], size[0]).T)

@@ -1,4 +1,4 @@
-"""Two families of message classes behind one door: rclpy's, for the graph, and those of ``rosbags``, for bags."""
+"""Two families of message classes behind one interface: rclpy's, for the graph, and those of ``rosbags``, for bags."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class MessageFamily:
 
     Args:
         message_class: full type name (``sensor_msgs/msg/Image``) -> message class, taking keyword arguments.
-        octets: bytes-like -> what the family wants in a ``uint8[]`` field.
-        numbers: floats -> what the family wants in a ``float64[]`` field.
+        octets: bytes-like -> what the family takes in a ``uint8[]`` field.
+        numbers: floats -> what the family takes in a ``float64[]`` field.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""All message encoding behind one face: stage types <-> ROS messages, byte for byte, and nothing else.
+"""All message encoding behind one interface: stage types <-> ROS messages, byte for byte, and nothing else.
 
 Everything else in the package asks this module alone, so other message types can take the place of these. The parts:
 :mod:`~hat_ros.io.table` and :mod:`~hat_ros.io.stage_tables` (stages), :mod:`~hat_ros.io.image_messages` (frames and

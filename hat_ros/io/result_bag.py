@@ -1,4 +1,4 @@
-"""The result bag: what every stage said about every frame, images excepted, with the truth beside it when known.
+"""The result bag: the answer of every stage to every frame, images excepted, with the ground truth where known.
 
 ``hat track`` writes it here, frame by frame; ``hat replay`` records the same messages from the graph. Both are read
 back into one :class:`~hat_ros.io.run_log.RunLog`. Bag time is the exposure stamp.
@@ -129,7 +129,7 @@ def read_result_bag(path: Path) -> RunLog:
 
 
 def read_stage_ms(path: Path) -> dict[str, float]:
-    """Node name -> mean wall time per frame in milliseconds, as the nodes last said in their diagnostics.
+    """Node name -> mean wall time per frame in milliseconds, as last reported in the diagnostics of the nodes.
 
     Empty for a bag that no graph has written, or where the graph had only begun.
 

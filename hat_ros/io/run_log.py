@@ -1,4 +1,4 @@
-"""A run, frame by frame, as arrays: what the result bag says, beside the truth when there is one."""
+"""A run, frame by frame, as arrays: what the result bag holds, beside the ground truth where it is known."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hat_ros.types import Candidates, Estimate, Motion, TrackState
 
 @dataclass(frozen=True)
 class RunLog:
-    """N admitted frames in stamp order; NaN, -1 or empty where a stage had nothing to say.
+    """N admitted frames in stamp order; NaN, -1 or empty where a stage had no answer.
 
     Attributes:
         stamp_ns: (N,) exposure stamps.
@@ -108,7 +108,7 @@ class RunLog:
 
 
 class RunLogBuilder:
-    """Collects what the stages said about each frame; the same for a run in process and a recorded graph."""
+    """Collects the answers of the stages frame by frame; the same for a run in process and a recorded graph."""
 
     def __init__(self) -> None:
         self._rows: list[dict[str, Any]] = []

@@ -17,7 +17,7 @@ from hat_ros.types import Alignment, Candidates, Estimate, Motion, Selection, Tr
 
 @dataclass(frozen=True)
 class Admitted:
-    """The record of entry of one frame, ``/hat/admission``: a stage knows from it what comes in which order.
+    """The record of entry of one frame, ``/hat/admission``: it gives every stage the order of the frames.
 
     Attributes:
         seq: number of the frame since the start of the run, from 0.
@@ -41,7 +41,7 @@ class Status:
 
 
 class StageWire(TableWire):
-    """Encodes what the stages say about a frame."""
+    """Encodes the answers of the stages to a frame."""
 
     def admission(self, stamp_ns: int, frame_id: str, admitted: Admitted) -> Any:
         """Table of ``/hat/admission``."""
@@ -123,7 +123,7 @@ def selection_from(message: Any) -> Selection:
 
 
 def motion_from(message: Any) -> Motion:
-    """Decode ``/hat/slam_state``; ``sigma_rad`` is for people and does not travel here."""
+    """Decode ``/hat/slam_state``; ``sigma_rad`` is in ``/hat/slam_odometry`` alone."""
     row = one_row(message, topics.MOTION_COLUMNS)
     pose_row = np.array([row[name] for name in topics.POSE_COLUMNS])
     valid = flag("valid", row["valid"])

@@ -55,7 +55,7 @@ TYPES: dict[str, str] = {
     END_OF_STREAM: "std_msgs/msg/Header",
 }
 
-# What a result bag holds: everything that the graph says, images excepted.
+# What a result bag holds: everything that the graph sends, images excepted.
 RECORDED = (
     HAT_CAMERA_INFO,
     ADMISSION,

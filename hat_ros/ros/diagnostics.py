@@ -1,4 +1,4 @@
-"""What a node says of itself in ``/diagnostics``: once a second, and at once when it changes."""
+"""The state that a node reports in ``/diagnostics``: once a second, and at once when it changes."""
 
 from __future__ import annotations
 

@@ -99,8 +99,8 @@ class Endpoints:
 
     def unmatched(self) -> list[str]:
         """Endpoints that do not know their counterparts yet; with none, nothing sent from now on is lost."""
-        silent = [f"a publisher of {t}" for t in sorted(self._required) if not self._inputs[t].get_publisher_count()]
-        return silent + [reader for topic in self._outputs for reader in self._missing_readers(topic)]
+        unheard = [f"a publisher of {t}" for t in sorted(self._required) if not self._inputs[t].get_publisher_count()]
+        return unheard + [reader for topic in self._outputs for reader in self._missing_readers(topic)]
 
     def _missing_readers(self, topic: str) -> list[str]:
         publisher, names = self._outputs[topic]

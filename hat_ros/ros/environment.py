@@ -48,7 +48,7 @@ def keep_large_blocks() -> None:
 
 
 def leave_cores_to_stages() -> None:
-    """One thread for OpenCV, unless the user's environment says how many: stages and frames in flight are the threads.
+    """One thread for OpenCV, unless the environment sets the number: stages and frames in flight are the threads.
 
     On two cores five nodes with a pool of OpenCV's in each were 7 % slower (measured on a clip before the Earth).
     """

@@ -94,7 +94,7 @@ def replay(
     Raises:
         InputError: bag, configuration or target is bad.
         StageTimeoutError: a stage did not answer; the message names it.
-        RunError: a node died or failed. The result up to there is in ``out``, readable.
+        RunError: a node ended early or failed. The result up to there is in ``out``, readable.
     """
     if graph not in ("processes", "single"):
         raise ConfigError(f"graph must be 'processes' or 'single', found '{graph}'")

@@ -1,7 +1,7 @@
 """What all nodes share: parameters, the lifecycle, errors of callbacks, readiness, the end of the stream.
 
 rclpy swallows exceptions of lifecycle callbacks and stops an executor on those of others, so both are caught here,
-once: a node that fails says so in one sentence, in ``/diagnostics`` and on stderr, and the process ends in a replay.
+once: a node that fails reports it in one sentence, in ``/diagnostics`` and on stderr, and the process ends in a replay.
 """
 
 from __future__ import annotations
@@ -175,7 +175,7 @@ class HatNode(LifecycleNode, ABC, Generic[SessionT]):
         return outcome if outcome != TransitionCallbackReturn.SUCCESS else super().on_cleanup(state)
 
     def on_shutdown(self, state: Any) -> TransitionCallbackReturn:
-        """Like cleanup, for good."""
+        """Like cleanup; the node cannot be configured again."""
         self.active = False
         return self._transition(self._cleanup)
 

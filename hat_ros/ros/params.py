@@ -37,7 +37,7 @@ _ROS_OWN = ("use_sim_time", "start_type_description_service")
 
 @dataclass(frozen=True)
 class Settings:
-    """What the parameters of a node say.
+    """The values of a node's parameters.
 
     Attributes:
         config: the configuration of all stages.
@@ -48,7 +48,7 @@ class Settings:
         autostart: configure and activate without a manager.
         exit_at_end: the process ends after the end of the stream.
         recorded: a recorder must be matched before the node is ready.
-        supervisor_pid: parent process to die with, 0 = none.
+        supervisor_pid: parent process whose end ends this one, 0 = none.
         extra: values of the options that only this node has.
     """
 

@@ -54,7 +54,7 @@ class Playback:
 
     @property
     def outstanding(self) -> int:
-        """Images sent of which nothing has been heard yet, neither a status nor a drop."""
+        """Images sent that are neither answered nor known to be dropped."""
         return self.sent - self.answered - self.dropped
 
     def take(self) -> Packet | None:

@@ -25,7 +25,7 @@ class PlayerSession(Session):
 
     Attributes:
         playback: counts and times.
-        said: node -> text of its last diagnostics.
+        texts: node -> text of its last diagnostics.
     """
 
     def __init__(self, node: HatNode[Any]) -> None:
@@ -40,7 +40,7 @@ class PlayerSession(Session):
         )
         choice = {name: extra[name] for name in ("rate", "first_frame", "max_frames")}
         self.playback = Playback(self._bag, self._config, live=settings.live, **choice)
-        self.said: dict[str, str] = {}
+        self.texts: dict[str, str] = {}
         self._is_open = False
         self._wait_for: list[str] = extra["wait_for"]
         self._ready_nodes: set[str] = set()
@@ -76,9 +76,9 @@ class PlayerSession(Session):
         """Frames refused after the last status are known from here alone; and why a node is not ready."""
         for status in message.status:
             name = status.name.removeprefix("hat: ")
-            if not self._is_open and self.said.get(name) != status.message:
+            if not self._is_open and self.texts.get(name) != status.message:
                 self.playback.progress_s = time.monotonic()  # a node with a new text is at work
-            self.said[name] = status.message
+            self.texts[name] = status.message
             if name == "segmentation":
                 counts = {item.key: item.value for item in status.values}
                 self.playback.note_dropped(int(counts.get("dropped", 0)))
@@ -103,8 +103,8 @@ class PlayerSession(Session):
 
     def _check_readiness(self) -> None:
         absent = [name for name in self._wait_for if name not in self._ready_nodes]
-        texts = "; ".join(f"{name}: {self.said.get(name, 'silent')}" for name in absent)
-        why = texts or self._node.endpoints.unmatched()
+        found = "; ".join(f"{name}: {self.texts.get(name, 'no diagnostics yet')}" for name in absent)
+        why = found or self._node.endpoints.unmatched()
         limit_s = self._config.startup_timeout_s
         check_progress(self.playback.progress_s, limit_s, f"the graph was not ready ({why})", "graph.startup_timeout_s")
 

@@ -52,7 +52,7 @@ def spin(executor: SingleThreadedExecutor, nodes: Sequence[HatNode[Any]], stop: 
 
 
 def close(executor: SingleThreadedExecutor, nodes: Sequence[HatNode[Any]]) -> None:
-    """Take nodes apart, also those of a process that was interrupted: what they hold open must be closed."""
+    """Close sessions and destroy nodes, also in a process that was interrupted."""
     executor.shutdown()
     for node in nodes:
         node.release()

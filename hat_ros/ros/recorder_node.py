@@ -47,7 +47,7 @@ class RecorderSession(Session):
         return dict(self.counts)
 
     def _on_message(self, topic: str, data: bytes) -> None:
-        # Diagnostics carry the wall clock; in the bag they stand beside the frame that was newest then.
+        # Diagnostics carry the wall clock; in the bag they get the stamp of the newest frame.
         clocked = topic == topics.DIAGNOSTICS
         stamp_ns = self.newest_ns[topics.ADMISSION] if clocked else stamp_of_cdr(data, self.writer.path)
         self.writer.write_cdr(topic, topics.TYPES[topic], data, stamp_ns)

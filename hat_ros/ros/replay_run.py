@@ -69,7 +69,7 @@ class ReplayRun:
         player: dict[str, Any],
     ) -> None:
         self._executor, self._processes, self._bag = executor, processes, bag
-        self._heard: dict[str, str] = {}
+        self._relayed: dict[str, str] = {}
         self._recorder_node = RecorderNode(context=executor.context, parameters=recorder)
         self._player_node = PlayerNode(context=executor.context, parameters=player)
         self._nodes: tuple[HatNode[Any], ...] = (self._recorder_node, self._player_node)
@@ -125,10 +125,10 @@ class ReplayRun:
 
     def _relay(self) -> None:
         """Log here what a node reports while it works on something that takes long."""
-        for name, text in self._player.said.items():
-            if self._heard.get(name) != text and text.startswith(BUSY):
+        for name, text in self._player.texts.items():
+            if self._relayed.get(name) != text and text.startswith(BUSY):
                 LOG.info("%s: %s", name, text.removeprefix(BUSY))
-            self._heard[name] = text
+            self._relayed[name] = text
 
     def _culprit(self) -> str:
         """The first stage in the data flow that is behind the one before it."""

@@ -13,7 +13,7 @@ from hat_ros.io import messages, topics
 from hat_ros.ros import qos
 from hat_ros.ros.diagnostics import OK, STEADY, WARN
 from hat_ros.ros.entrance import Entrance
-from hat_ros.ros.flights import Flights
+from hat_ros.ros.frames_in_flight import FramesInFlight
 from hat_ros.ros.node import HatNode
 from hat_ros.ros.pacing import ExtraDelay, StepTimer
 from hat_ros.ros.session import Session
@@ -34,7 +34,7 @@ class SegmentationSession(Session):
         self._stage = SegmentationStage(config, node.settings.load_target())
         self._priors = PriorBuffer(config.prior)
         self._entrance = Entrance(live, annotated)
-        self._flights = Flights(config.graph, live)
+        self._in_flight = FramesInFlight(config.graph, live)
         self._epoch = 0
         self._camera_sent = self._is_open = False
         self._ready_nodes: set[str] = set()
@@ -65,9 +65,9 @@ class SegmentationSession(Session):
 
     def values(self) -> dict[str, Any]:
         """Figures for diagnostics."""
-        in_flight = len(self._flights.admission.in_flight)
+        in_flight = len(self._in_flight.admission.in_flight)
         counts = {
-            "admitted": self._flights.admitted,
+            "admitted": self._in_flight.admitted,
             "dropped": self._entrance.dropped_total,
             "in_flight": in_flight,
         }
@@ -90,7 +90,7 @@ class SegmentationSession(Session):
     def _on_status(self, message: Any) -> None:
         estimate = messages.status_from(message).estimate
         self._priors.push(estimate)
-        if self._flights.leave(estimate.stamp_ns):
+        if self._in_flight.leave(estimate.stamp_ns):
             self._diagnostics.report(OK, "running")
         self._pump()
 
@@ -106,9 +106,9 @@ class SegmentationSession(Session):
     def _pump(self) -> None:
         if not self._is_open:
             self._is_open = self._ready_nodes >= _STAGES and not self._node.endpoints.unmatched()
-        while self._is_open and self._flights.admission.has_credit:
+        while self._is_open and self._in_flight.admission.has_credit:
             try:
-                found = self._entrance.next_frame(self._flights.admission)
+                found = self._entrance.next_frame(self._in_flight.admission)
             except FrameError as error:
                 self._diagnostics.report(WARN, str(error))
                 continue
@@ -122,7 +122,7 @@ class SegmentationSession(Session):
             self._camera_sent = True
             self._camera_info.publish(self._wire.camera_info(stamp_ns, frame_id, frame.camera))
             self._camera_info.wait_for_all_acked(Duration(seconds=5))  # it must be there before its first image
-        seq = self._flights.enter(stamp_ns)
+        seq = self._in_flight.enter(stamp_ns)
         admitted = messages.Admitted(seq, self._entrance.dropped_total, self._epoch)
         self._admission.publish(self._wire.admission(stamp_ns, frame_id, admitted))
         self._delay.wait()
@@ -132,7 +132,7 @@ class SegmentationSession(Session):
 
     def _check_time(self) -> None:
         """A stage that does not answer: a replay ends, a live graph goes on in a new epoch."""
-        overdue = self._flights.overdue()
+        overdue = self._in_flight.overdue()
         if overdue is not None:
             self._new_epoch()
             self._is_open = False

@@ -16,7 +16,7 @@ from hat_ros.ros.session import Session
 
 
 class Resettable(Protocol):
-    """A stage, as far as its node cares."""
+    """What a node needs of its stage beside ``update``."""
 
     def reset(self) -> None:
         """Forget the target's state."""

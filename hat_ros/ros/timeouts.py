@@ -1,4 +1,4 @@
-"""How long a graph may take to answer, and what is said when it does not."""
+"""How long a graph may take to answer, and the error when it takes longer."""
 
 from __future__ import annotations
 

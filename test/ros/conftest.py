@@ -1,15 +1,19 @@
-"""A short clip of the project's own making, and what one process says about it."""
+"""A short synthetic clip with the answers of one process to it, and an executor for single nodes."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+import rclpy
 from graph_clip import CONFIG_OVERRIDES, FIRST_NS, N_FRAMES, STEP_NS, run_in_process
+from rclpy.executors import SingleThreadedExecutor
 
 from hat_ros.bench.synth.clips import ClipSpec, render_clip
 from hat_ros.bench.synth.models import write_model
 from hat_ros.config import load_config
 from hat_ros.io.bag_writer import BagWriter
+from hat_ros.ros import process
+from hat_ros.ros.node import HatNode
 from hat_ros.target.loading import load_target
 
 SPEC = ClipSpec(
@@ -62,3 +66,13 @@ def clean_bag(write_bag):
 def in_process(clean_bag, config, tmp_path_factory):
     """Topic -> what one process says, as a result bag would hold it."""
     return run_in_process(clean_bag, config, tmp_path_factory.mktemp("in_process") / "bag")
+
+
+@pytest.fixture
+def executor():
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context, domain_id=115)
+    executor = SingleThreadedExecutor(context=context)
+    yield executor
+    process.close(executor, [node for node in executor.get_nodes() if isinstance(node, HatNode)])
+    context.try_shutdown()

@@ -2,23 +2,12 @@
 
 from __future__ import annotations
 
-import os
-
-import cv2
 import pytest
 import rclpy
 from rclpy.parameter import Parameter
 
 from hat_ros.config import describe, flat_options
 from hat_ros.errors import ConfigError
-from hat_ros.ros.environment import (
-    OPENCV_THREADS,
-    PROFILE,
-    RANGE,
-    leave_cores_to_stages,
-    prepare_environment,
-    profile_path,
-)
 from hat_ros.ros.player_node import PlayerNode
 from hat_ros.ros.selector_node import SelectorNode
 
@@ -95,35 +84,3 @@ def test_parameters_cannot_change_under_a_running_stage(make):
     node = make()
     (result,) = node.set_parameters([Parameter("selector.score_scale", value=1.0)])
     assert not result.successful
-
-
-def test_profile_fits_the_shared_memory_there_is(monkeypatch, tmp_path):
-    assert profile_path(tmp_path / "none").name == "fastdds_small.xml"
-    space = os.statvfs_result((4096, 4096, 2**24, 2**24, 2**24, 0, 0, 0, 0, 255))
-    monkeypatch.setattr(os, "statvfs", lambda _: space)
-    assert "<segment_size>67108864<" in profile_path().read_text()
-
-
-def test_environment_defaults_leave_the_user_alone(monkeypatch):
-    monkeypatch.delenv(PROFILE, raising=False)
-    monkeypatch.setenv(RANGE, "SUBNET")
-    prepare_environment()
-    assert os.environ[PROFILE] == str(profile_path())
-    assert os.environ[RANGE] == "SUBNET"
-    monkeypatch.setenv(PROFILE, "/mine.xml")
-    prepare_environment()
-    assert os.environ[PROFILE] == "/mine.xml"
-
-
-def test_nodes_keep_opencv_to_one_thread_unless_the_user_says_otherwise(monkeypatch):
-    before = cv2.getNumThreads()
-    try:
-        cv2.setNumThreads(2)
-        monkeypatch.setenv(OPENCV_THREADS, "2")
-        leave_cores_to_stages()
-        assert cv2.getNumThreads() == 2
-        monkeypatch.delenv(OPENCV_THREADS)
-        leave_cores_to_stages()
-        assert cv2.getNumThreads() == 1
-    finally:
-        cv2.setNumThreads(before)

@@ -65,10 +65,3 @@ def test_bad_parameters_are_one_sentence_and_exit_code_two():
         "node selector: unknown parameter 'selector.score_scal': did you mean 'selector.score_scale'?"
     )
     assert "Traceback" not in said
-
-
-def test_reserved_domains_differ():
-    with reserved_domain(None) as first, reserved_domain(None) as second:
-        assert first != second
-    with reserved_domain(42) as given:
-        assert given == 42

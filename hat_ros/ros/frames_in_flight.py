@@ -10,7 +10,7 @@ from hat_ros.errors import StageTimeoutError
 from hat_ros.ros.timeouts import HANGS, answer_limit
 
 
-class Flights:
+class FramesInFlight:
     """Admits frames by credit and notices one that is not answered in time.
 
     Args:
