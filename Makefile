@@ -41,7 +41,7 @@ count: install  ## rooms, arrows, lines, constants and keys of what the default 
 	$(BIN)/python tools/count.py
 
 docs: $(VENV)/.docs  ## the site of docs/ into build/site; a warning fails
-	$(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 wheel-check: install  ## sdist, wheel, empty environment with the pinned versions: track and replay a clip
 	PYTHON=$(PYTHON) tools/check_wheel.sh pinned
