@@ -66,6 +66,9 @@ _RANGES = (
     Column("depth_energy_share", "depth's share of E_t^2", ".1%"),
 )
 
+# What a run of the front ends depends on.
+_FRONT_END_SECTIONS = ("segmentation", "hypotheses", "slam", "nets", "refinement")
+
 # Runs per clip, by what they are for.
 OBSERVED, MASKED_OTHERWISE, TRACKING = "observed", "masked-otherwise", "tracking"
 
@@ -108,42 +111,33 @@ def plan(
         UsageError: two recordings have the same name.
         RunError: ``out`` cannot be written.
     """
-    merged = load_config(config, overrides)
-    if front_end is not None:
-        front = load_config(front_end, overrides)
-        merged = replace(
-            merged,
-            segmentation=front.segmentation,
-            hypotheses=front.hypotheses,
-            slam=front.slam,
-            nets=front.nets,
-            refinement=front.refinement,
-            # How scores are scaled and whether candidates of one frame support each other is the estimator's nature.
-            selector=replace(
-                merged.selector, score_scale=front.selector.score_scale, running_gate=front.selector.running_gate
-            ),
-        )
     if len({spec.name for spec, _ in clips}) < len(clips):
         raise UsageError("two recordings have the same name: rename one of them")
+    merged = _merged(config, front_end, overrides)
+    # Without the temporal settings, so that runs of the front ends are used again when only those change.
+    front_ends = HatConfig(**{name: getattr(merged, name) for name in _FRONT_END_SECTIONS})
     try:
         out.mkdir(parents=True, exist_ok=True)
         write_config(out, merged)
-        # Without the temporal settings, so that runs of the front ends are used again when only those change.
         (out / "front_end").mkdir(exist_ok=True)
-        write_config(
-            out / "front_end",
-            HatConfig(
-                segmentation=merged.segmentation,
-                hypotheses=merged.hypotheses,
-                slam=merged.slam,
-                nets=merged.nets,
-                refinement=merged.refinement,
-            ),
-        )
+        write_config(out / "front_end", front_ends)
     except OSError as error:
         raise RunError(f"cannot write {out}: {error.strerror}") from None
     jobs = [job for clip in clips for job in _front_end_jobs(*clip, str(out / "front_end" / CONFIG_FILE), limit)]
     return Plan(merged, jobs)
+
+
+def _merged(config: str, front_end: str | None, overrides: Sequence[str]) -> HatConfig:
+    """Temporal settings of one preset with the front ends of another."""
+    merged = load_config(config, overrides)
+    if front_end is None:
+        return merged
+    front = load_config(front_end, overrides)
+    # How scores are scaled and whether candidates of one frame support each other is the estimator's nature.
+    selector = replace(
+        merged.selector, score_scale=front.selector.score_scale, running_gate=front.selector.running_gate
+    )
+    return replace(merged, selector=selector, **{name: getattr(front, name) for name in _FRONT_END_SECTIONS})
 
 
 def _front_end_jobs(spec: SourceSpec, settings: tuple[str, ...], config_file: str, limit: int | None) -> list[Job]:

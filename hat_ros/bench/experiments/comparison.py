@@ -172,7 +172,7 @@ def bench_jobs(
         config: preset or YAML file.
         overrides: settings for all runs.
         limit: at most this many frames per run.
-        externals: name of a method that is not ours -> its file of poses, ``{clip}`` standing for the clip's name.
+        externals: name of a method outside this package -> its file of poses, ``{clip}`` standing for the clip's name.
         methods: methods under other names, each with a configuration of its own.
 
     Raises:
@@ -197,12 +197,17 @@ def bench_jobs(
                     jobs[name] = Job(name, spec, entry.mode, entry.config, settings, start, limit, labels)
         for start in starts:
             for method, pattern in (externals or {}).items():
-                name, poses = f"{spec.name}-{method}-{start}", Path(pattern.replace("{clip}", spec.name)).resolve()
-                if not poses.exists():
-                    raise UsageError(f"--poses {method}: {poses} does not exist; use {{clip}} for the clip's name")
-                labels = _labels(spec, "-", start, method)
-                jobs[name] = Job(name, spec, method, config, (), start, limit, labels, poses)
+                job = _external_job(spec, method, pattern, config, start, limit)
+                jobs[job.name] = job
     return list(jobs.values())
+
+
+def _external_job(spec: SourceSpec, method: str, pattern: str, config: str, start: int, limit: int | None) -> Job:
+    poses = Path(pattern.replace("{clip}", spec.name)).resolve()
+    if not poses.exists():
+        raise UsageError(f"--poses {method}: {poses} does not exist; use {{clip}} for the clip's name")
+    labels = _labels(spec, "-", start, method)
+    return Job(f"{spec.name}-{method}-{start}", spec, method, config, (), start, limit, labels, poses)
 
 
 def _labels(spec: SourceSpec, masks: str, start: int, name: str) -> dict[str, str]:

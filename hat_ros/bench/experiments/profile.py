@@ -112,24 +112,8 @@ def profile(source: Source, config: HatConfig, limit: int | None = None, watch: 
         InputError: bad input, as in a run.
     """
     wait, device, peak_mib = _device(config)
-    given = config.segmentation.backend in GIVEN_MASK_BACKENDS
-    total, done = source.count(0, limit), []
-    mark = time.perf_counter()
     meter = Meter(wait)
-    with ExitStack() as measured:
-        measured.enter_context(listening(meter.part))
-        if _is_learned(config):
-            measured.enter_context(meter.networks())
-        with meter.stage(CONSTRUCTION):
-            tracker = HatTracker(config, source.target, meter.wrap)
-        for frame in source.frames(0, limit, given):
-            if not isinstance(frame, Frame):
-                continue
-            step = tracker.step(frame)
-            before, mark = mark, time.perf_counter()
-            done.append(_Metered(len(step.candidates) > 0, mark - before, meter.take()))
-            if watch is not None:
-                watch(len(done), total, step.estimate.state)
+    done = _frames(source, config, limit, meter, watch)
     first = next((index for index, frame in enumerate(done) if frame.keyframe), None)
     if first is None:
         raise UsageError(f"{source.path}: none of {len(done)} frames was a keyframe, so there is nothing to measure")
@@ -158,6 +142,31 @@ class _Metered:
     keyframe: bool
     seconds: float
     tallies: dict[str, Tally]
+
+
+def _frames(
+    source: Source, config: HatConfig, limit: int | None, meter: Meter, watch: Watcher | None
+) -> list[_Metered]:
+    """Run HAT; the first frame takes the time of construction."""
+    given = config.segmentation.backend in GIVEN_MASK_BACKENDS
+    total = source.count(0, limit)
+    done: list[_Metered] = []
+    mark = time.perf_counter()
+    with ExitStack() as measured:
+        measured.enter_context(listening(meter.part))
+        if _is_learned(config):
+            measured.enter_context(meter.networks())
+        with meter.stage(CONSTRUCTION):
+            tracker = HatTracker(config, source.target, meter.wrap)
+        for frame in source.frames(0, limit, given):
+            if not isinstance(frame, Frame):
+                continue
+            step = tracker.step(frame)
+            before, mark = mark, time.perf_counter()
+            done.append(_Metered(len(step.candidates) > 0, mark - before, meter.take()))
+            if watch is not None:
+                watch(len(done), total, step.estimate.state)
+    return done
 
 
 def _summed(frames: Sequence[_Metered], count: int = 1) -> dict[str, Tally]:
