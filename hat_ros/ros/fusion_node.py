@@ -14,6 +14,7 @@ from hat_ros.ros.diagnostics import OK
 from hat_ros.ros.joined_frames import JoinedFrame
 from hat_ros.ros.node import HatNode
 from hat_ros.ros.pose_output import PoseOutput
+from hat_ros.ros.session import Session
 from hat_ros.ros.stage_node import StageSession
 from hat_ros.tracker import choose_fusion
 from hat_ros.types import Camera, Detection, Frame
@@ -26,7 +27,7 @@ _NO_IMAGE = np.zeros((1, 1, 3), dtype=np.uint8)
 class FusionSession(StageSession):
     """Fuses anchors and motion into one pose per frame."""
 
-    def __init__(self, node: HatNode[Any]) -> None:
+    def __init__(self, node: HatNode[Session]) -> None:
         settings, config = node.settings, node.settings.config
         target = settings.load_target()
         self._stage = FusionStage(config, choose_fusion(config, target))

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import sys
-from typing import Any
 
 from hat_ros.hypotheses.stage import HypothesisStage
 from hat_ros.io import topics
 from hat_ros.ros import process
 from hat_ros.ros.joined_frames import JoinedFrame
 from hat_ros.ros.node import HatNode
+from hat_ros.ros.session import Session
 from hat_ros.ros.stage_node import StageSession
 
 
 class HypothesesSession(StageSession):
     """Generates pose candidates at keyframes."""
 
-    def __init__(self, node: HatNode[Any]) -> None:
+    def __init__(self, node: HatNode[Session]) -> None:
         self._stage = HypothesisStage(node.settings.config, node.settings.load_target())
         super().__init__(node, self._stage, (topics.FRAME,), uses_prior=True)
         self._wire = node.wire

@@ -28,10 +28,10 @@ from hat_ros.ros.session import Session
 
 _ACK_TIMEOUT_S = 10.0
 
-SessionT = TypeVar("SessionT", bound=Session)
+SessionT_co = TypeVar("SessionT_co", bound=Session, covariant=True)
 
 
-class HatNode(LifecycleNode, ABC, Generic[SessionT]):
+class HatNode(LifecycleNode, ABC, Generic[SessionT_co]):
     """A lifecycle node in ``/hat``; what it does is in its :class:`~hat_ros.ros.session.Session`.
 
     Attributes:
@@ -60,7 +60,7 @@ class HatNode(LifecycleNode, ABC, Generic[SessionT]):
         self.wire = Wire.ros()
         self.active = self.finished = False
         self.failure: HatError | None = None
-        self._session: SessionT | None = None
+        self._session: SessionT_co | None = None
         self._announced = False
         self.endpoints = Endpoints(self, self.settings.live, self.settings.recorded, self.guarded)
         self.diagnostics = Diagnostics(self, self.wire, self.values)
@@ -69,11 +69,11 @@ class HatNode(LifecycleNode, ABC, Generic[SessionT]):
         self._announcer = self.create_timer(0.02, self._announce, clock=STEADY)
 
     @abstractmethod
-    def open_session(self) -> SessionT:
+    def open_session(self) -> SessionT_co:
         """Build what the node owns while it is configured, endpoints included."""
 
     @property
-    def session(self) -> SessionT:
+    def session(self) -> SessionT_co:
         """What the node owns.
 
         Raises:

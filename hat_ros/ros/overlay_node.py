@@ -25,7 +25,7 @@ _FRAMES_KEPT = 32
 class OverlaySession(Session):
     """Draws each estimate into its own image, found by exact stamp."""
 
-    def __init__(self, node: HatNode[Any]) -> None:
+    def __init__(self, node: HatNode[Session]) -> None:
         self._painter = OverlayPainter(node.settings.load_target())
         self._quality: int = node.settings.extra["jpeg_quality"]
         self._wire, self._endpoints = node.wire, node.endpoints

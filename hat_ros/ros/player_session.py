@@ -28,7 +28,7 @@ class PlayerSession(Session):
         texts: node -> text of its last diagnostics.
     """
 
-    def __init__(self, node: HatNode[Any]) -> None:
+    def __init__(self, node: HatNode[Session]) -> None:
         settings, extra = node.settings, node.settings.extra
         if not extra["bag"]:
             raise ConfigError("parameter 'bag' is empty: give the bag to play, -p bag:=FOLDER")

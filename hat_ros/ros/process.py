@@ -7,7 +7,6 @@ import signal
 import sys
 from collections.abc import Sequence
 from types import FrameType
-from typing import Any
 
 import rclpy
 from rclpy.context import Context
@@ -17,6 +16,7 @@ from rclpy.signals import SignalHandlerOptions
 from hat_ros.errors import HatError
 from hat_ros.ros.environment import keep_large_blocks, leave_cores_to_stages, prepare_environment
 from hat_ros.ros.node import HatNode
+from hat_ros.ros.session import Session
 
 
 class StopRequest:
@@ -41,7 +41,7 @@ class StopRequest:
             raise KeyboardInterrupt
 
 
-def spin(executor: SingleThreadedExecutor, nodes: Sequence[HatNode[Any]], stop: StopRequest) -> HatError | None:
+def spin(executor: SingleThreadedExecutor, nodes: Sequence[HatNode[Session]], stop: StopRequest) -> HatError | None:
     """Run nodes until all have finished, one has failed, or the process is asked to end; the failure if any."""
     while not stop.made and not all(node.finished for node in nodes):
         failed = next((node for node in nodes if node.failure is not None), None)
@@ -51,7 +51,7 @@ def spin(executor: SingleThreadedExecutor, nodes: Sequence[HatNode[Any]], stop: 
     return None
 
 
-def close(executor: SingleThreadedExecutor, nodes: Sequence[HatNode[Any]]) -> None:
+def close(executor: SingleThreadedExecutor, nodes: Sequence[HatNode[Session]]) -> None:
     """Close sessions and destroy nodes, also in a process that was interrupted."""
     executor.shutdown()
     for node in nodes:
@@ -59,7 +59,7 @@ def close(executor: SingleThreadedExecutor, nodes: Sequence[HatNode[Any]]) -> No
         node.destroy_node()
 
 
-def main(node_classes: Sequence[type[HatNode[Any]]], args: Sequence[str] | None = None) -> int:
+def main(node_classes: Sequence[type[HatNode[Session]]], args: Sequence[str] | None = None) -> int:
     """Entry point of every node process: 0 done, 1 failed, 2 bad input, with one sentence on stderr."""
     prepare_environment()
     keep_large_blocks()
@@ -69,7 +69,7 @@ def main(node_classes: Sequence[type[HatNode[Any]]], args: Sequence[str] | None 
     arguments = list(sys.argv if args is None else args)
     rclpy.init(args=arguments, context=context, signal_handler_options=SignalHandlerOptions.NO)
     executor = SingleThreadedExecutor(context=context)
-    nodes: list[HatNode[Any]] = []
+    nodes: list[HatNode[Session]] = []
     stop = StopRequest()
     try:
         stop.install()

@@ -26,7 +26,7 @@ class RecorderSession(Session):
         writer: the result bag, open until :meth:`close`.
     """
 
-    def __init__(self, node: HatNode[Any]) -> None:
+    def __init__(self, node: HatNode[Session]) -> None:
         out = node.settings.extra["out"]
         if not out:
             raise ConfigError("parameter 'out' is empty: give the folder of the bag to write, -p out:=FOLDER")

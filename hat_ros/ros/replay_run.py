@@ -22,6 +22,7 @@ from hat_ros.ros.playback import Playback
 from hat_ros.ros.player_node import PlayerNode
 from hat_ros.ros.process import close as close_nodes
 from hat_ros.ros.recorder_node import RecorderNode
+from hat_ros.ros.session import Session
 from hat_ros.ros.stage_processes import StageProcesses
 
 LOG = logging.getLogger(__name__)
@@ -72,7 +73,7 @@ class ReplayRun:
         self._relayed: dict[str, str] = {}
         self._recorder_node = RecorderNode(context=executor.context, parameters=recorder)
         self._player_node = PlayerNode(context=executor.context, parameters=player)
-        self._nodes: tuple[HatNode[Any], ...] = (self._recorder_node, self._player_node)
+        self._nodes: tuple[HatNode[Session], ...] = (self._recorder_node, self._player_node)
         try:
             for node in self._nodes:
                 executor.add_node(node)

@@ -27,7 +27,7 @@ _STAGES = {"hypotheses", "slam", "selector", "fusion"}
 class SegmentationSession(Session):
     """Admits a frame while it has a credit (W in replay, 1 live) and the whole graph is matched."""
 
-    def __init__(self, node: HatNode[Any]) -> None:
+    def __init__(self, node: HatNode[Session]) -> None:
         config, live = node.settings.config, node.settings.live
         annotated = config.segmentation.backend == "annotated"
         self._node, self._wire, self._diagnostics = node, node.wire, node.diagnostics

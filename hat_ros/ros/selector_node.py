@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import sys
-from typing import Any
 
 from hat_ros.core.selector import SelectorStage
 from hat_ros.io import messages, topics
 from hat_ros.ros import process
 from hat_ros.ros.joined_frames import JoinedFrame
 from hat_ros.ros.node import HatNode
+from hat_ros.ros.session import Session
 from hat_ros.ros.stage_node import StageSession
 
 
 class SelectorSession(StageSession):
     """Decodes which candidate is the anchor."""
 
-    def __init__(self, node: HatNode[Any]) -> None:
+    def __init__(self, node: HatNode[Session]) -> None:
         self._stage = SelectorStage(node.settings.config.selector)
         super().__init__(node, self._stage, (topics.HYPOTHESES_SCORED, topics.SLAM_STATE))
         self._wire = node.wire

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Protocol
 
@@ -33,7 +33,9 @@ class StageSession(Session, ABC):
         uses_prior: the stage takes fused poses of the past, if the configuration enables them.
     """
 
-    def __init__(self, node: HatNode[Any], stage: Resettable, joined: Sequence[str], uses_prior: bool = False) -> None:
+    def __init__(
+        self, node: HatNode[Session], stage: Resettable, joined: Sequence[str], uses_prior: bool = False
+    ) -> None:
         config = node.settings.config
         self._diagnostics = node.diagnostics
         self._frames = JoinedFrames(joined, config.prior if uses_prior else None, stage.reset)
@@ -62,7 +64,7 @@ class StageSession(Session, ABC):
         if missing is not None and len(self._frames) > 1:
             self._diagnostics.report(WARN, f"frame {missing[0]} waits for {', '.join(missing[1])}")
 
-    def _receive(self, put: Any, message: Any) -> None:
+    def _receive(self, put: Callable[[Any], None], message: Any) -> None:
         put(message)
         while (joined := self._frames.take()) is not None:
             self._delay.wait()

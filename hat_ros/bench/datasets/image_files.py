@@ -17,7 +17,7 @@ from hat_ros.geometry import lie
 from hat_ros.types import Camera, Frame
 
 if TYPE_CHECKING:
-    from hat_ros.io.detections import DetectionLookup
+    from hat_ros.bench.datasets.detections import DetectionLookup
 
 # Sequences without a clock: 10 frames a second from one second on, so that no stamp is zero.
 FIRST_STAMP_NS = 1_000_000_000

@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 
 from hat_ros.array_types import UInt8
+from hat_ros.bench.datasets.detections import load_detections
 from hat_ros.bench.datasets.image_files import ImageFile, ImageRecording
 from hat_ros.errors import DatasetError, UsageError
 from hat_ros.io.bag_writer import BagWriter
-from hat_ros.io.detections import load_detections
 from hat_ros.io.provenance import input_hash
 from hat_ros.target.loading import load_target
 from hat_ros.target.rendering import create_renderer

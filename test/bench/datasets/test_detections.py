@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hat_ros.bench.datasets.detections import decode_rle, load_detections
 from hat_ros.errors import DatasetError
-from hat_ros.io.detections import decode_rle, load_detections
 
 SIZE = (12, 20)
 
