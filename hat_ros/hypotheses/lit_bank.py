@@ -1,10 +1,10 @@
-"""What a target looks like from everywhere under every sun: brightness instead of silhouettes.
+"""A view bank of brightness instead of silhouettes: views from all sides under many directions of the sun.
 
-Before a black sky a mask holds only what is lit, so its shape may be that of no view at all. The brightness itself does
-not suffer: what is dark weighs nothing, in the image as in the prediction. Each view under each sun is laid on the same
+Before a black sky a mask holds only what is lit, so its shape may be that of no view at all. Brightness can still be
+compared: what is dark has no weight, in the image as in the prediction. Each view under each sun is laid on the same
 polar grid as the silhouettes of :mod:`hat_ros.target.view_bank`, about the centroid of its light, so that the same
-product of spectra correlates it with an image at every in-plane angle. Of what is compared the root is taken: gloss,
-which the model does not know, would outweigh everything else.
+product of spectra correlates it with an image at every in-plane angle. The square root of brightness is compared,
+because gloss, which is not modelled, would dominate otherwise.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from hat_ros.types import Camera
 
 _FORMAT = 2
 _N_VIEWS = 162
-# Angles between the sun and the camera, seen from the target, each with that many suns around the line of sight.
+# Phase angles (sun, target, camera) in degrees, each with a number of suns around the line of sight.
 # Nearer to the camera hardly anything is in shadow, further away hardly anything is lit.
 _SUNS = ((40.0, 6), (75.0, 8), (110.0, 8))
 _DISTANCE_RADII = 8.0
 _RENDER_PX = 80
-# A view with less light than this mean brightness of the silhouette tells nothing.
+# Views whose silhouette is darker than this on average are left out.
 _MIN_BRIGHTNESS = 0.01
 # Brightness of the contour from which the image can show it.
 _VISIBLE = 0.1
@@ -100,7 +100,7 @@ def build_lit(viewer: TargetViewer, n_angles: int) -> LitBank:
 
 
 class _OneView:
-    """The target from one direction, to be put under many suns."""
+    """The target from one direction, to be shaded under many suns."""
 
     def __init__(self, viewer: TargetViewer, R: Float, distance_m: float) -> None:
         focal = 0.5 * (_RENDER_PX - 6) / np.tan(np.arcsin(1.0 / _DISTANCE_RADII))

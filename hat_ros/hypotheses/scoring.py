@@ -28,7 +28,8 @@ _MISMATCH_PX = 0.3
 _DARK_SHARE = 0.7
 # Independent samples in a reduced image: residuals err together over parts of the body.
 LIGHT_WEIGHT = 18.0
-# Light is looked for this far around the mask, above the sky's noise in grey levels; the least sum that tells anything.
+# Light counts up to this far around the mask, and above the sky's noise in grey levels; with a smaller sum in all there
+# is no comparison.
 _HALO_PX = 9
 _SKY_NOISE = 2.0
 _MIN_LIGHT = 500.0

@@ -12,7 +12,7 @@ A pose predicted from the past is one more start, whatever its health: where the
 candidate of its own would lose to chance.
 
 Unless the best candidate is where a healthy track expects it, more is tried. A mask that no view fits well is matched
-as part of a silhouette, unless light is going to tell and there is a prior. Before a black sky the mask holds what is
+as part of a silhouette, unless shading decides and there is a prior. Before a black sky the mask holds what is
 lit, which need not be the whole target: matches of brightness (``lit_bank``) compete as well, and of those only the
 sunlit part of the contour is compared with the mask. Stray light around the mask is taken off before, where the sky is
 black otherwise. Before anything else more shape matches are tried where no candidate leads clearly. At last the best
@@ -65,18 +65,18 @@ _MIN_SCALE_PX = 1.5
 # than this share of the mask's longer side may belong to a part that the mask lacks, and counts as that far.
 _REFINED_SHARE = 1 / 3
 _FAR_SHARE = 0.1
-# Without a prior there is nothing to fall back on: so many times as many coarse matches are looked at (six times found
+# Without a prior the search is global: so many times as many coarse matches are refined (six times found
 # no more right poses than three on clips with poor masks, and more wrong ones).
 _UNAIDED_FACTOR = 3
 # Before the mask's bias is known, outlines this close agree.
 _SELECTION_TOLERANCE_PX = 1.0
 # Best shape score below which the mask is taken to be incomplete.
 _POOR_SCORE = -6.0
-# Score short of the best at which no sunlight helps.
+# So far behind the best score, shading cannot make up for it.
 _LIGHT_MATTERS = 14.0
-# With a healthy prior among the starts, fewer matches: they are there to contradict it, not to find the target.
+# With a healthy prior among the starts, fewer matches: enough to detect a competing basin.
 _TRACKED_DIVISOR = 2
-# Where light is going to tell, so many times fewer shape matches compete: on six dark clips no right one was below.
+# Where shading decides, so many times fewer shape matches compete: on six dark clips no right one was below.
 _LIT_DIVISOR = 2
 # A lead in log-likelihood that ends the search; without one, so many times the usual shape matches are tried.
 _CLEAR_LEAD = 6.0
@@ -171,7 +171,7 @@ class TemplateHypotheses:
         placements = whole_placement(compared.mask)
         aligned = self._align(starts + self._coarse(compared, placements, frame, field, n_coarse), frame, scorer)
         best = max(aligned, key=lambda a: a.score, default=None)
-        # Light will find what lies in shadow; without a prior both ways are tried.
+        # Shading finds poses whose shadowed parts the mask lacks; without a prior both searches run.
         relies_on_light = scorer.dark_around and prior is not None
         explained = best is not None and (best.score >= _POOR_SCORE or self._confirms(best.T_cam_target, prior))
         if best is None or not (explained or relies_on_light):
@@ -200,14 +200,14 @@ class TemplateHypotheses:
         if len(self._near_symmetries):
             scored += self._finish(self._align(self._counterparts(scored), frame, scorer), frame, scorer)
             if not scorer.dark_around:
-                scored = self._closer_look(scored, frame, scorer)
+                scored = self._compare_details(scored, frame, scorer)
         scored.sort(key=lambda pair: -pair[1])
         T, score = np.stack([T for T, _ in scored]), np.array([score for _, score in scored])
         keep = distinct(T[:, :3, :3], self._max_candidates, np.radians(_SAME_DEG))
         return Candidates.from_matrices(T[keep], score[keep], detection.box_xyxy)
 
     def reset(self) -> None:
-        """Nothing to forget: every keyframe stands for itself."""
+        """Nothing is kept between keyframes."""
 
     def _coarse(
         self,
@@ -292,10 +292,10 @@ class TemplateHypotheses:
         leader, _ = max(scored, key=lambda pair: pair[1])
         return [leader, *(turned(leader, turn, self._target.center_m) for turn in self._near_symmetries)]
 
-    def _closer_look(
+    def _compare_details(
         self, scored: list[tuple[Float, float]], frame: Frame, scorer: Scorer
     ) -> list[tuple[Float, float]]:
-        """The same, the best candidate and those that look like it compared once more by their details."""
+        """The same; the best candidate and those of nearly its silhouette are compared again at a finer resolution."""
         basin = np.stack([T[:3, :3] for T in self._alike(scored)])
         rest: list[tuple[Float, float]] = []
         best: dict[int, tuple[Float, float]] = {}
@@ -319,7 +319,7 @@ class TemplateHypotheses:
         return bool(apart_rad < np.radians(self._options.separation_deg))
 
     def _is_clear(self, scored: list[tuple[Float, float]], prior: PosePrior | None) -> bool:
-        """Whether a candidate leads all other basins by far, or leads where the track expects it."""
+        """Whether a candidate leads all other basins clearly, or leads in the basin of a healthy prior."""
         if not scored:
             return False
         leader, best = max(scored, key=lambda pair: pair[1])
@@ -359,7 +359,7 @@ class TemplateHypotheses:
 
 
 def _outline_distance_px(T_cam_target: Float, points_m: Float, camera: Camera, field: MaskField) -> float:
-    """Mean distance of contour points (N, 3) from a mask's outline, pixels; far ones count as not quite so far."""
+    """Mean distance of contour points (N, 3) from a mask's outline, pixels; far ones are clipped."""
     uv = camera.project(points_m @ T_cam_target[:3, :3].T + T_cam_target[:3, 3]) - field.origin_px
     u, v = (np.ascontiguousarray(uv[None, :, axis], np.float32) for axis in range(2))
     distance = cv2.remap(field.distance, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

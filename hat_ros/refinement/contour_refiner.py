@@ -29,7 +29,7 @@ _SHADOW_SHARE = 0.05
 # of the silhouette), and not little of what it misses is black.
 _SMALL_SHARE, _BLACK_SHARE = 0.03, 0.2
 # A sunlit contour is a stub, which fits anything, where silhouette and mask disagree by so many pixels along it;
-# where they disagree by so many times that before it is refined, refining does not help.
+# where they disagree by so many times that at the start, refinement is not tried.
 _STUB_MISFIT_PX = 5.0
 _HOPELESS_FACTOR = 2.0
 # From a good prediction the fine round alone arrives: this share of the contour agrees, and nothing moved further.
@@ -116,7 +116,7 @@ class ContourRefiner:
             The refined pose with its uncertainty, or None when the target is out of view, nothing in the image can be
             measured, or the refinement would leave the basin.
         """
-        task = self._task(self._look(frame, detection), T_cam_target, prior)
+        task = self._task(self._prepared(frame, detection), T_cam_target, prior)
         in_shadow = task.areas is not None and _lies_in_shadow(task.areas)
         if in_shadow:
             sunlit = self._sunlit(task)
@@ -134,10 +134,10 @@ class ContourRefiner:
         return sunlit if sunlit is not None and sunlit.quality > refined.quality else refined
 
     def reset(self) -> None:
-        """Let go of the last image; nothing else is kept, every frame stands for itself."""
+        """Forget the last image; nothing else is kept between frames."""
         self._image = None
 
-    def _look(self, frame: Frame, detection: Detection | None) -> _Image:
+    def _prepared(self, frame: Frame, detection: Detection | None) -> _Image:
         """Prepare an image, unless it is the one before."""
         if self._image is None or self._image.frame is not frame or self._image.detection is not detection:
             self._image = _Image(frame, detection)
@@ -172,7 +172,7 @@ class ContourRefiner:
         return refined if refined is not None and refined.misfit_px <= _STUB_MISFIT_PX else None
 
     def _judged(self, task: _Task, fit: Fit, areas: Overlap | None) -> Refined | None:
-        """What a fit is worth by its agreement with the mask; None when it left the basin of its start."""
+        """The result with its covariance and its agreement with the mask; None when it left the basin of its start."""
         if not self._same_basin(task.start, fit.T_cam_target):
             return None
         covariance = pose_covariance(fit, self._target.bounding_radius_m)

@@ -1,4 +1,4 @@
-"""What rays found of a surface, and which of it faces the sun. Compiled: small loops, thousands of times a second."""
+"""Points, normals and sun incidence where rays hit a surface. Compiled: small loops, thousands of calls a second."""
 
 from __future__ import annotations
 

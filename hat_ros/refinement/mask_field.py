@@ -14,7 +14,7 @@ from hat_ros.array_types import Bool, Float, Float32, UInt8
 from hat_ros.geometry.masks import mask_moments
 from hat_ros.refinement.view import View
 
-# Luma at which background is bright enough to tell that no target covers it; a shadowed part is black.
+# Luma from which a pixel is certainly not a shadowed part of the target, which is black.
 VISIBLE_LEVEL = 32.0
 # The field reaches this far around the mask, pixels and share of the mask's longer side.
 _MIN_MARGIN_PX = 20

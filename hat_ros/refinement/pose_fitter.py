@@ -19,8 +19,8 @@ _NO_ORIGIN = np.zeros(2)
 _SAME_CONTOUR_PX = 1.0
 # A contour point agrees with the image when its edge or the mask's boundary lies this close, pixels.
 _AGREE_PX = 2.5
-# How much an edge must count by itself to say that the target is there. With a mask that is known, and a step too small
-# for an edge, as on black before black, is no evidence against a pose.
+# The least weight of an edge that supports a pose by itself. With a mask the target is known to be there, and a step
+# too small for an edge, as on black before black, is no evidence against a pose.
 _MIN_EDGE = 0.1
 # Damping while only the mask's outline is known and the start is far off.
 _PULL_DAMPING = 1e-3
@@ -46,7 +46,7 @@ _BESIDE_SHARE = 0.15
 _CENTRING_PX = 64
 # Where the image border cuts the target, what is seen of it changes with each move.
 _CENTRING_STEPS = 4
-# The mask leads the way, then the image's own edges take over; without a mask long lines lead the way.
+# From coarse to fine: first the mask, then the image's own edges; without a mask, first long search lines.
 WITH_MASK = (
     Schedule((0, 0, 6, 4), (1, 1, 3, 2), (10, 6, 4, 3), damping=3e-3),
     Schedule((4, 4, 3.5, 3), (2, 1.5, 1.5, 1.5), (2.5, 2, 1.5, 1.5)),
@@ -126,7 +126,7 @@ class PoseFitter:
         to_sun_cam: Float | None = None,
         view: View | None = None,
     ) -> Fit | None:
-        """Refine a pose, held to what is known of its rotation; None when the target leaves the view on the way.
+        """Refine a pose under a rotation prior; None when the target leaves the view on the way.
 
         With a direction to the sun the contour is that of the sunlit part. The view of the start spares its rendering.
         """

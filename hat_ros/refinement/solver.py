@@ -19,7 +19,7 @@ MIN_REACH_PX = 2.0
 NOISE_LEVEL = 4.0
 # Scatter of a line about its step, in squared contrasts, at which an edge counts half.
 SCATTER_REF = 0.04
-# Neither masks nor edges are trusted beyond a quarter of a pixel.
+# No residual's standard deviation is taken for less than a quarter of a pixel.
 VARIANCE_FLOOR_PX2 = 0.0625
 # Contour length over which residuals err together, one independent sample each: pixels, and a share of the outline,
 # because shadows and misfits of the CAD model come in parts of the body.

@@ -31,7 +31,7 @@ _CROP_MARGIN_PX = 4
 _ROUNDING_PX = 1e-6
 # What lies further outside the image than this share of its longer side is not rendered.
 _BEYOND_IMAGE = 0.05
-# Shadow rays start this far off the surface, in bounding radii; light this close to grazing shows nothing.
+# Shadow rays start this far off the surface, in bounding radii; light this close to grazing counts as none.
 _SHADOW_START = 2e-3
 _GRAZING = 0.02
 
@@ -190,7 +190,7 @@ class TargetViewer:
 
 @dataclass(frozen=True, eq=False)
 class ContourLines:
-    """The contour of a view as the solver wants it.
+    """The contour of a view in the form that the solver takes.
 
     Attributes:
         points_m: (N, 3) in the target frame.

@@ -1,7 +1,7 @@
-"""Turns that hardly change a target's silhouettes: orientations that a mask alone cannot tell apart.
+"""Near-symmetries: turns that hardly change a target's silhouettes, so that a mask alone is ambiguous.
 
-A body with two or four equal sides is often asymmetric in details only, an antenna or a colour. A search by shape finds
-its two orientations together or not at all, and a pose of the past finds only its own.
+A body with two or four equal sides is often asymmetric in details only, an antenna or a colour. A search by shape may
+find one of its orientations only, and a predicted pose brings only its own.
 """
 
 from __future__ import annotations

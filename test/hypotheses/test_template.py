@@ -147,7 +147,7 @@ def test_a_healthy_prior_is_a_candidate(backend, target):
     assert turn.min() < 1
 
 
-def test_a_prior_that_nobody_trusts_competes_in_full_light_and_in_part(backend, target, monkeypatch):
+def test_an_unhealthy_prior_competes_in_full_light_and_in_part(backend, target, monkeypatch):
     T_true = random_pose(np.random.default_rng(2), target)
     monkeypatch.setattr(backend, "_coarse", lambda *_: [])
     monkeypatch.setattr(backend, "_coarse_lit", lambda *_: [])

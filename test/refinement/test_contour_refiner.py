@@ -85,7 +85,7 @@ def test_a_dark_rim_makes_no_round_body_small_and_far_frame_after_frame(barrel, 
 
 
 @pytest.mark.parametrize(("seed", "to_sun"), [(1, (-0.5, 0.2, 1.0)), (5, (0.0, 0.3, 1.0))])
-def test_a_sun_that_lights_hardly_any_contour_is_not_believed(refiner, target, monkeypatch, seed, to_sun):
+def test_a_sun_that_lights_hardly_any_contour_is_not_used(refiner, target, monkeypatch, seed, to_sun):
     T_true = random_pose(np.random.default_rng(seed), target)
     frame, mask = picture(target, T_true)
     unlit = mask & (np.cumsum(mask.sum(axis=0)) < 0.1 * mask.sum())  # its left tenth, black on black

@@ -129,8 +129,8 @@ def test_nothing_is_missed_in_the_shadow(viewer):
     frame, _ = sunlit_picture(viewer.target, T, sun)
     luma = frame.rgb.max(axis=2)
     field = MaskField(luma > 40)
-    blind = field.compare(viewer.view(T, CAMERA, 160), luma)
-    knowing = field.compare(viewer.view(T, CAMERA, 160, sun), luma)
-    assert knowing.hidden < 0.4 * blind.hidden
-    assert knowing.extra == blind.extra
-    assert knowing.union_share > blind.union_share
+    shadowless = field.compare(viewer.view(T, CAMERA, 160), luma)
+    shadowed = field.compare(viewer.view(T, CAMERA, 160, sun), luma)
+    assert shadowed.hidden < 0.4 * shadowless.hidden
+    assert shadowed.extra == shadowless.extra
+    assert shadowed.union_share > shadowless.union_share

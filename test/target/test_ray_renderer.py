@@ -8,12 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hat_ros.bench.synth.models import build_target
-from hat_ros.errors import ConfigError, MissingDependencyError
 from hat_ros.geometry import lie
 from hat_ros.target.loading import target_from_scene
 from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.target.rays import pixel_rays
-from hat_ros.target.rendering import create_renderer
 from hat_ros.types import Camera
 
 CAMERA = Camera(np.array([[200.0, 0.0, 63.0], [0.0, 210.0, 47.5], [0.0, 0.0, 1.0]]), 128, 96)
@@ -133,27 +131,6 @@ def test_the_silhouette_alone_is_that_of_the_picture(t):
 def test_a_camera_inside_the_model_sees_its_inner_walls():
     view = RayRenderer(scene_target(trimesh.creation.box((2, 2, 2)))).render(at([0, 0, 0]), CAMERA)
     assert view.mask.all() and view.depth_m.min() > 0.9
-
-
-def test_unknown_renderer():
-    with pytest.raises(ConfigError, match="rays"):
-        create_renderer("vulkan", build_target("cubesat"))
-
-
-def test_pyrender_agrees_or_says_what_is_missing():
-    target, T = build_target("observer"), at([0, 0, 6.0], (1.0, 0.3, 0.1))
-    try:
-        renderer = create_renderer("pyrender", target)
-        view = renderer.render(T, CAMERA)
-    except MissingDependencyError as error:
-        assert "rays" in str(error)
-        return
-    traced = RayRenderer(target).render(T, CAMERA)
-    both = view.mask & traced.mask
-    assert both.sum() > 0.95 * traced.mask.sum()
-    assert np.median(np.abs(view.depth_m - traced.depth_m)[both]) < 0.01
-    assert np.abs(view.rgb[both].astype(float) - traced.rgb[both]).mean() < 20
-    renderer.close()
 
 
 @pytest.mark.parametrize("t", [(0, 0, 4), (0.3, -0.2, 2.5), (1.3, 0.9, 3), (0, 0, 60)])
