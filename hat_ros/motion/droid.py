@@ -123,11 +123,11 @@ def offline_motions(
         return [Motion.none() for _ in used]
 
     def images() -> Iterator[tuple[int, torch.Tensor]]:
-        for index in indices:  # one at a time: a clip need not fit into memory
+        for index in indices.tolist():  # one at a time: a clip need not fit into memory
             frame, _ = clip[index]
             yield frame.stamp_ns, torch.from_numpy(prepare(frame, config.slam.droid)[0]).to(slam._device)
 
-    image, intrinsics = prepare(clip[indices[0]][0], config.slam.droid)
+    image, intrinsics = prepare(clip[int(indices[0])][0], config.slam.droid)
     frontend = slam._new_frontend(image, intrinsics, keep_all=True)
     for stamp_ns, image_bgr in images():
         frontend.track(stamp_ns, image_bgr)
@@ -153,7 +153,7 @@ def prepare(frame: Frame, config: DroidConfig) -> tuple[UInt8, Float]:
             f"slam.droid.input_area_px {config.input_area_px} makes a {new_w}x{new_h} image of {width}x{height}: "
             f"both sides need at least {_MIN_SIDE * STRIDE_PX} px, raise it"
         )
-    resized = cv2.resize(frame.rgb, (new_w, new_h), interpolation=cv2.INTER_LINEAR)
+    resized = np.asarray(cv2.resize(frame.rgb, (new_w, new_h), interpolation=cv2.INTER_LINEAR), np.uint8)
     cropped = resized[: new_h - new_h % STRIDE_PX, : new_w - new_w % STRIDE_PX, ::-1]
     K, sx, sy = frame.camera.K, new_w / width, new_h / height
     # The released pre-processing scales the principal point without the half-pixel shift.

@@ -36,7 +36,7 @@ class DroidFrontend:
         model: the flow network.
         intrinsics: (4,) ``fx fy cx cy`` in units of 8 pixels, on the device to use.
         shape: (h, w) of the images divided by 8.
-        keep_all: never retire keyframes (the offline reference needs them all).
+        keep_all: never retire keyframes (smoothing over the whole clip needs them all).
         stored: keep correlation volumes of the active edges.
     """
 
@@ -70,7 +70,7 @@ class DroidFrontend:
             (7,) ``T_cam_world`` of this frame, None before initialisation.
         """
         features = self.model.features(image_bgr)
-        is_keyframe = not len(self.keyframes) or self.motion_score(features) > self.config.filter_threshold
+        is_keyframe = self.motion_score(features) > self.config.filter_threshold
         if is_keyframe:
             self._make_room()
             self._append(stamp_ns, features, image_bgr)
@@ -82,7 +82,12 @@ class DroidFrontend:
         return self.read_out(stamp_ns, features)
 
     def motion_score(self, features: Tensor) -> float:
-        """Mean flow from the last keyframe after one update, in units of 8 pixels. Waits for the device."""
+        """Mean flow from the last keyframe after one update, in units of 8 pixels; infinite before the first keyframe.
+
+        Waits for the device.
+        """
+        if self._last_context is None:
+            return float("inf")
         frames, last = self.keyframes, slice(len(self.keyframes) - 1, len(self.keyframes))
         correlation = self.model.correlation(frames.features[last], features, self.stored)
         _, delta, _ = self.model.refine(*self._last_context, correlation.lookup(self._grid), None)

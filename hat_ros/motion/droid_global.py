@@ -71,8 +71,8 @@ def adjust_globally(frontend: DroidFrontend, steps: int) -> None:
             lookup = model.correlation(frames.features[i], frames.features[j], False).lookup(coords[edges])
             hidden[edges], delta, weight[edges] = model.refine(hidden[edges], frames.inp[i], lookup, motion[edges])
             target[edges] = coords[edges] + delta
-            sources, group = np.unique(pairs[part, 0], return_inverse=True)
-            group = torch.from_numpy(group).to(device)
+            sources, source_of = np.unique(pairs[part, 0], return_inverse=True)
+            group = torch.from_numpy(source_of).to(device)
             frames.eta[torch.from_numpy(sources).to(device)] = model.damping(hidden[edges], group, len(sources))
         frames.poses, frames.disparities = bundle_adjust(
             frames.poses,

@@ -170,11 +170,11 @@ class FactorGraph:
         target, _ = reproject(frames.poses, frames.disparities, frames.intrinsics, new_i, new_j)
         hidden = frames.hidden[new_i]
         correlation = self.model.correlation(frames.features[new_i], frames.features[new_j], self.stored)
-        if len(self):
+        if self.correlation is None or not len(self):
+            self.hidden, self.correlation = hidden, correlation
+        else:
             self.hidden = torch.cat([self.hidden, hidden])
             self.correlation.append(correlation)
-        else:
-            self.hidden, self.correlation = hidden, correlation
         self.target = torch.cat([self.target, target])
         self.weight = torch.cat([self.weight, torch.zeros_like(target)])
         self.ii, self.jj = np.concatenate([self.ii, pairs[:, 0]]), np.concatenate([self.jj, pairs[:, 1]])
@@ -210,7 +210,8 @@ class FactorGraph:
         self.ii, self.jj, self.age = self.ii[~mask], self.jj[~mask], self.age[~mask]
         kept = self._send(np.flatnonzero(~mask))
         self.hidden, self.target, self.weight = self.hidden[kept], self.target[kept], self.weight[kept]
-        self.correlation.select(kept)
+        if self.correlation is not None:
+            self.correlation.select(kept)
 
     def borrow(self, other: FactorGraph, first_source: int) -> None:
         """Take the edges of another graph that start at ``first_source`` or later as retired ones of this graph."""
@@ -262,6 +263,7 @@ class FactorGraph:
         frames, plan = self.keyframes, self._planned(first, use_inactive)
         coords, _ = reproject(frames.poses, frames.disparities, frames.intrinsics, plan.ii, plan.jj)
         motion = torch.cat([coords - self._grid, self.target - coords], dim=-1).permute(0, 3, 1, 2)
+        assert self.correlation is not None, "an update needs edges"
         lookup = self.correlation.lookup(coords)
         self.hidden, delta, self.weight = self.model.refine(self.hidden, frames.inp[plan.ii], lookup, motion)
         self.target = coords + delta

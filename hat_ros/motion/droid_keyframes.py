@@ -6,7 +6,7 @@ will start from.
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, Self
 
 import torch
 from torch import Tensor
@@ -27,7 +27,7 @@ class PairCorrelation(Protocol):
         """Keep these edges, in this order."""
         ...
 
-    def append(self, other: PairCorrelation) -> None:
+    def append(self, other: Self) -> None:
         """Add edges."""
         ...
 
@@ -52,7 +52,9 @@ class FlowModel(Protocol):
         """Correlation of image pairs."""
         ...
 
-    def refine(self, hidden: Tensor, inp: Tensor, lookup: Tensor, motion: Tensor | None) -> tuple[Tensor, ...]:
+    def refine(
+        self, hidden: Tensor, inp: Tensor, lookup: Tensor, motion: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Next hidden state, flow correction (E, h, w, 2) and its confidence (E, h, w, 2)."""
         ...
 

@@ -6,16 +6,19 @@ is never revised; what the window learns later about its past only shapes what i
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import cv2
 import numpy as np
 from numba import njit
 
 from hat_ros.array_types import Float, UInt8
-from hat_ros.config import HatConfig
+from hat_ros.config import FeatureSlamConfig, HatConfig
 from hat_ros.geometry import lie
 from hat_ros.motion.surface import SurfacePrior
 from hat_ros.motion.tracks import PointTracks, detect
-from hat_ros.motion.window import Window, rehearse
+from hat_ros.motion.window import Window, warm_up
 from hat_ros.target.model import Target
 from hat_ros.target.rays import ray_caster
 from hat_ros.types import Camera, Detection, Frame, Motion, PosePrior
@@ -33,8 +36,8 @@ _NEIGHBOURS, _NEIGHBOUR_SIGMA = 5, 10.0
 _NEIGHBOUR_SOFTENING_PX = 5.0
 # A camera that moves about a static scene, often in a hand, accelerates this much more than a body tumbling in space.
 _CAMERA_AGILITY = 30.0
-# Rival solutions are tried every so many frames: the mirror image, and the CAD's when it disagrees this much.
-_RIVAL_PERIOD = 5
+# Alternative solutions are tried every so many frames: the mirror image, and the CAD's when it disagrees this much.
+_ALTERNATIVE_PERIOD = 5
 _MIN_PRIOR_AGREEMENT = 0.7
 
 
@@ -47,16 +50,15 @@ class FeatureSlam:
     """
 
     def __init__(self, config: HatConfig, target: Target | None) -> None:
-        self._config = config.slam.feature
-        self._masked = config.slam.masked
-        self._delay_frames = config.prior.delay_frames
+        self._config, self._masked = config.slam.feature, config.slam.masked
+        self._new_surface: Callable[[], SurfacePrior] | None = None
         # In a whole scene the target is a small part: its surface would say little, and pull at everything.
-        self._target = target if config.slam.feature.use_prior and self._masked else None
-        self._caster = None if self._target is None else ray_caster(self._target)
-        self._epoch = 0
-        self._camera: Camera | None = None
-        self._forget()
-        rehearse(self._config)
+        if target is not None and self._config.use_prior and self._masked:
+            caster, radius_m = ray_caster(target), target.bounding_radius_m
+            self._new_surface = partial(SurfacePrior, self._config, caster, radius_m, config.prior.delay_frames)
+        self._number = 0
+        self._epoch: _Epoch | None = None
+        warm_up(self._config)
         depth_beside(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1))
         blank = np.ones((32, 32), np.uint8)
         detect(blank, blank, np.zeros((1, 2)), 1, self._config.spacing_px)
@@ -72,69 +74,97 @@ class FeatureSlam:
         Returns:
             ``T_slam_cam``; not valid when there is too little to go by.
         """
-        if self._masked and detection is None:
-            return Motion.none(self._epoch)
-        if self._camera is not None and not _same_camera(self._camera, frame.camera):
+        region = self._region(frame, detection)
+        if region is None:
+            return Motion.none(self._number)
+        if self._epoch is not None and not _same_camera(self._epoch.camera, frame.camera):
             self.reset()
-        self._camera = frame.camera
-        image = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        region = detection.mask.view(np.uint8) if self._masked else np.ones(image.shape, np.uint8)
-        if self._window is None:
-            return self._start(frame.stamp_ns, image, region)
-        if not self._advance(frame.stamp_ns, image, region, prior):
-            self._n_lost += 1
-            if self._n_lost >= _LOST_FRAMES:
+        image = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
+        if self._epoch is None:
+            self._epoch = self._started(frame, image, region)
+            return Motion.none(self._number) if self._epoch is None else self._epoch.motion(self._number)
+        if not self._epoch.advance(frame.stamp_ns, image, region, prior):
+            if self._epoch.n_lost >= _LOST_FRAMES:
                 self.reset()
-            return Motion.none(self._epoch)
-        return self._motion()
+            return Motion.none(self._number)
+        return self._epoch.motion(self._number)
 
     def reset(self) -> None:
         """Start a new epoch, if the present one has begun."""
-        if self._window is not None:
-            self._epoch += 1
-        self._forget()
+        if self._epoch is not None:
+            self._number += 1
+        self._epoch = None
 
-    def _forget(self) -> None:
-        self._window: Window | None = None
-        self._tracks = PointTracks(self._config.max_points, self._config.spacing_px)
-        self._surface: SurfacePrior | None = None
-        self._n_wrong = np.zeros(self._config.max_points, dtype=np.int64)
-        self._n_lost = 0
-        self._met_prior = False
+    def _region(self, frame: Frame, detection: Detection | None) -> UInt8 | None:
+        """(H, W) nonzero where points may lie; None when nothing is known of it."""
+        if not self._masked:
+            return np.ones(frame.rgb.shape[:2], np.uint8)
+        return None if detection is None else detection.mask.view(np.uint8)
 
-    def _start(self, stamp_ns: int, image: UInt8, region: UInt8) -> Motion:
-        """First frame of an epoch: defines the gauge, if it shows enough points."""
-        slots = self._tracks.replenish(image, region)
+    def _started(self, frame: Frame, image: UInt8, region: UInt8) -> _Epoch | None:
+        """The epoch that begins with a frame, if it shows enough points."""
+        tracks = PointTracks(self._config.max_points, self._config.spacing_px)
+        slots = tracks.replenish(image, region)
         if len(slots) < _MIN_POINTS:
-            self._forget()
-            return Motion.none(self._epoch)
-        xn = self._normalise(self._tracks.xy[slots])
+            return None
         rows, cols = np.nonzero(region)
-        center = self._normalise(np.array([cols.mean(), rows.mean()]))
-        focal = float(np.sqrt(self._camera.K[0, 0] * self._camera.K[1, 1]))
+        center = normalise(frame.camera, np.array([cols.mean(), rows.mean()]))
+        focal = float(np.sqrt(frame.camera.K[0, 0] * frame.camera.K[1, 1]))
         radius = float(np.sqrt(len(rows) / np.pi) / focal)
         agility = 1.0 if self._masked else _CAMERA_AGILITY
-        self._window = Window(self._config, stamp_ns, center, radius, focal, agility)
+        window = Window(self._config, frame.stamp_ns, center, radius, focal, agility)
         z = np.ones(len(slots))
         if self._masked:
-            z -= _FIRST_BULGE * radius * (bulge(region, self._tracks.xy[slots]) - 0.5)
-        self._window.place(slots, xn, z, _FIRST_SIGMA * radius)
-        if self._target is not None:
-            radius_m = self._target.bounding_radius_m
-            self._surface = SurfacePrior(self._config, self._caster, radius_m, self._delay_frames)
-            self._surface.remember(self._window, self._tracks.track_id)
-        return self._motion()
+            z -= _FIRST_BULGE * radius * (bulge(region, tracks.xy[slots]) - 0.5)
+        window.place(slots, normalise(frame.camera, tracks.xy[slots]), z, _FIRST_SIGMA * radius)
+        surface = None if self._new_surface is None else self._new_surface()
+        return _Epoch(self._config, self._masked, frame.camera, tracks, window, surface)
 
-    def _advance(self, stamp_ns: int, image: UInt8, region: UInt8, prior: PosePrior | None) -> bool:
-        """One frame more; False when the points do not say where it was taken."""
+
+class _Epoch:
+    """Tracks and window from one first frame on, which defines the gauge.
+
+    Args:
+        config: settings.
+        masked: whether only a rigid target is seen.
+        camera: of all frames.
+        tracks: points of the first frame.
+        window: with the first frame and its points.
+        surface: the CAD model's prior, None = no prior.
+
+    Attributes:
+        n_lost: frames without an answer since the last one with.
+    """
+
+    def __init__(
+        self,
+        config: FeatureSlamConfig,
+        masked: bool,
+        camera: Camera,
+        tracks: PointTracks,
+        window: Window,
+        surface: SurfacePrior | None,
+    ) -> None:
+        self._config, self._masked = config, masked
+        self.camera = camera
+        self._tracks, self._window, self._surface = tracks, window, surface
+        self._n_wrong = np.zeros(config.max_points, dtype=np.int64)
+        self._met_prior = False
+        self.n_lost = 0
+        if surface is not None:
+            surface.remember(window, tracks.track_id)
+
+    def advance(self, stamp_ns: int, image: UInt8, region: UInt8, prior: PosePrior | None) -> bool:
+        """One frame more; False when the points do not tell where it was taken."""
         window, tracks = self._window, self._tracks
         tracks.advance(image, region, self._guess(stamp_ns))
-        xn = self._normalise(tracks.xy)
+        xn = normalise(self.camera, tracks.xy)
         R, t, residual_px = window.locate(stamp_ns, xn, tracks.alive)
         right = residual_px < _WRONG_PX
         if np.count_nonzero(right) < _MIN_POINTS:
+            self.n_lost += 1
             return False
-        self._n_lost = 0
+        self.n_lost = 0
         self._n_wrong = np.where(right, 0, self._n_wrong + 1)
         seen = tracks.alive.copy()
         tracks.alive &= self._n_wrong < _WRONG_FRAMES
@@ -145,12 +175,21 @@ class FeatureSlam:
             if prior is not None and prior.healthy:
                 self._surface.expect(window, tracks.track_id, prior)
         window.adjust()
-        self._try_rivals(prior)
+        self._try_alternatives(prior)
         window.emit()
         self._replenish(image, region)
         return True
 
-    def _try_rivals(self, prior: PosePrior | None) -> None:
+    def motion(self, number: int) -> Motion:
+        """The newest pose as it is given out, in the epoch of this number."""
+        window = self._window
+        T_slam_cam = lie.inverse(lie.transform(window.R_emitted[-1], window.t[-1]))
+        sigma_rad = window.step_sigma_rad() if len(window) > 1 else 0.0
+        if not sigma_rad <= np.radians(self._config.max_step_sigma_deg):
+            return Motion.none(number, len(window))
+        return Motion(True, number, lie.row_from_matrix(T_slam_cam), len(window), sigma_rad)
+
+    def _try_alternatives(self, prior: PosePrior | None) -> None:
         """Now and then ask whether another solution, or another opinion of the prior, explains the tracks better."""
         window = self._window
         prior_known = np.count_nonzero(window.n_looks) >= _MIN_POINTS
@@ -160,15 +199,15 @@ class FeatureSlam:
             return
         # A trusted CAD surface leaves little room for another solution, nor does the depth of a whole scene.
         certain = window.trusts_prior or not self._masked
-        turn, phase = divmod(window.number[-1], _RIVAL_PERIOD * (2 if certain else 1))
+        turn, phase = divmod(window.number[-1], _ALTERNATIVE_PERIOD * (2 if certain else 1))
         if phase == 0 and len(window) > 3:
             if window.trusts_prior and turn % 2 == 0:
                 window.challenge_prior()
-            elif prior is None or self._target is None:
+            elif prior is None or self._surface is None:
                 window.challenge_structure()
             else:
-                turn = lie.so3_log(prior.T_cam_target[:3, :3] @ lie.matrix_from_row(prior.fused_row)[:3, :3].T)
-                window.challenge_structure(prior.stamp_ns, turn)
+                seen_turn = lie.so3_log(prior.T_cam_target[:3, :3] @ lie.matrix_from_row(prior.fused_row)[:3, :3].T)
+                window.challenge_structure(prior.stamp_ns, seen_turn)
         elif phase == 2 and prior_known and window.prior_agreement() < _MIN_PRIOR_AGREEMENT:
             window.try_prior()
 
@@ -180,7 +219,7 @@ class FeatureSlam:
         after = window.points_in_camera(R, t)
         front = (before[:, 2] > 0) & (after[:, 2] > 0)
         before, after = np.where(front[:, None], before, 1.0), np.where(front[:, None], after, 1.0)
-        return self._tracks.xy + self._camera.project(after) - self._camera.project(before)
+        return self._tracks.xy + self.camera.project(after) - self.camera.project(before)
 
     def _replenish(self, image: UInt8, region: UInt8) -> None:
         window, tracks = self._window, self._tracks
@@ -191,22 +230,15 @@ class FeatureSlam:
         z = window.points_in_camera(window.R[-1], window.t[-1])[known, 2]
         z_new, relief = depth_beside(tracks.xy[slots], tracks.xy[known], z)
         sigma = _NEIGHBOUR_SIGMA * max(relief, 0.1 * window.radius)
-        window.place(slots, self._normalise(tracks.xy[slots]), z_new, sigma)
+        window.place(slots, normalise(self.camera, tracks.xy[slots]), z_new, sigma)
         self._n_wrong[slots] = 0
 
-    def _motion(self) -> Motion:
-        window = self._window
-        T_slam_cam = lie.inverse(lie.transform(window.R_emitted[-1], window.t[-1]))
-        sigma_rad = window.step_sigma_rad() if len(window) > 1 else 0.0
-        if not sigma_rad <= np.radians(self._config.max_step_sigma_deg):
-            return Motion.none(self._epoch, len(window))
-        return Motion(True, self._epoch, lie.row_from_matrix(T_slam_cam), len(window), sigma_rad)
 
-    def _normalise(self, xy: Float) -> Float:
-        """Normalised coordinates of pixels: (..., 2) -> (..., 2)."""
-        K = self._camera.K
-        y = (xy[..., 1] - K[1, 2]) / K[1, 1]
-        return np.stack([(xy[..., 0] - K[0, 2] - K[0, 1] * y) / K[0, 0], y], axis=-1)
+def normalise(camera: Camera, xy: Float) -> Float:
+    """Normalised coordinates of pixels: (..., 2) -> (..., 2)."""
+    K = camera.K
+    y = (xy[..., 1] - K[1, 2]) / K[1, 1]
+    return np.stack([(xy[..., 0] - K[0, 2] - K[0, 1] * y) / K[0, 0], y], axis=-1)
 
 
 @njit(cache=True, nogil=True)

@@ -11,6 +11,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from hat_ros.array_types import Bool, UInt8
 from hat_ros.config import HatConfig
 from hat_ros.stages import create_backend
 from hat_ros.target.model import Target
@@ -55,7 +56,7 @@ class MotionStage:
         self._backend.reset()
 
 
-def suppress_background(rgb: np.ndarray, mask: np.ndarray) -> np.ndarray:
+def suppress_background(rgb: UInt8, mask: Bool) -> UInt8:
     """Black outside the mask: (H, W, 3) uint8, (H, W) bool -> (H, W, 3) uint8."""
     # Tens of times faster than a broadcast product.
-    return cv2.copyTo(rgb, mask.view(np.uint8), np.zeros_like(rgb))
+    return np.asarray(cv2.copyTo(rgb, mask.view(np.uint8), np.zeros_like(rgb)), np.uint8)

@@ -1,4 +1,4 @@
-"""What fused poses of the past say about the window: depths on the CAD surface, and rotations.
+"""What fused poses of the past tell about the window: depths on the CAD surface, and rotations.
 
 Depth is used relative to the median depth of the same frame, so a prior changes neither gauge nor scale of the SLAM
 frame by more than a slow pull that keeps the scale from drifting. Rotations count up to one common turn. Both enter

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from hat_ros.array_types import Bool, Float, Int, UInt8
+from hat_ros.array_types import Bool, Float, Float32, Int, UInt8
 
 _WINDOW_PX = 17
 _LEVELS = 3
@@ -23,7 +23,7 @@ _CROP_PAD_PX = 32
 # Weakest corner accepted, as a share of the strongest (Shi and Tomasi's smaller eigenvalue).
 _CORNER_QUALITY = 0.004
 # Points keep apart by this share of what an even spread over the region would give: the strongest corners of a scene
-# crowd together, and a crowd says little about depth.
+# crowd together, and a crowd tells little about depth.
 _EVENNESS = 0.5
 # New corners are looked for once this share of the slots is free, ...
 _WORTHWHILE_SHARE = 0.1
@@ -65,7 +65,8 @@ class PointTracks:
             xy_guess: (N, 2) expected positions.
         """
         slots = np.flatnonzero(self.alive)
-        xy, found = follow(self._image, image, self.xy[slots], xy_guess[slots])
+        before = image if self._image is None else self._image
+        xy, found = follow(before, image, self.xy[slots], xy_guess[slots])
         size = np.array([image.shape[1], image.shape[0]]) - 1
         col, row = np.clip(np.rint(xy).astype(int), 0, size).T
         found &= region[row, col] > 0
@@ -112,18 +113,28 @@ def follow(previous: UInt8, current: UInt8, xy: Float, xy_guess: Float) -> tuple
     after = np.ascontiguousarray(current[y0:y1, x0:x1])
     origin = np.array([x0, y0], dtype=np.float64)
     start, guess = (xy - origin).astype(np.float32), (xy_guess - origin).astype(np.float32)
-    options = {
-        "winSize": (_WINDOW_PX, _WINDOW_PX),
-        "criteria": _CRITERIA,
-        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
-        "minEigThreshold": _MIN_EIGENVALUE,
-    }
-    moved, ok, _ = cv2.calcOpticalFlowPyrLK(before, after, start, guess, maxLevel=_LEVELS, **options)
-    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, start.copy(), maxLevel=0, **options)
-    found = (ok.ravel() > 0) & (ok_back.ravel() > 0) & (np.linalg.norm(back - start, axis=1) < _BACKWARD_TOLERANCE_PX)
+    moved, ok = _lucas_kanade(before, after, start, guess, _LEVELS)
+    back, ok_back = _lucas_kanade(after, before, moved, start.copy(), 0)
+    found = ok & ok_back & (np.linalg.norm(back - start, axis=1) < _BACKWARD_TOLERANCE_PX)
     size = np.array([x1 - x0, y1 - y0])
     found &= ((moved >= 0) & (moved <= size - 1)).all(axis=1)
     return moved.astype(np.float64) + origin, found
+
+
+def _lucas_kanade(before: UInt8, after: UInt8, start: Float32, guess: Float32, levels: int) -> tuple[Float32, Bool]:
+    """(M, 2) points of one image followed into another from guesses (M, 2), which are overwritten; (M,) found."""
+    moved, ok, _ = cv2.calcOpticalFlowPyrLK(
+        before,
+        after,
+        start,
+        guess,
+        winSize=(_WINDOW_PX, _WINDOW_PX),
+        maxLevel=levels,
+        criteria=_CRITERIA,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=_MIN_EIGENVALUE,
+    )
+    return np.asarray(moved, np.float32), ok.ravel() > 0
 
 
 def detect(image: UInt8, region: UInt8, taken: Float, count: int, spacing_px: float) -> Float:
@@ -144,8 +155,9 @@ def detect(image: UInt8, region: UInt8, taken: Float, count: int, spacing_px: fl
         return np.zeros((0, 2))
     free = region[y : y + height, x : x + width].copy()
     radius = max(1, round(spacing_px))
-    disk = cv2.circle(np.zeros((2 * radius + 1, 2 * radius + 1), np.uint8), (radius, radius), radius, 1, -1)
-    clear_disks(free, np.rint(taken).astype(np.int64) - [x, y], disk)
+    disk = np.zeros((2 * radius + 1, 2 * radius + 1), np.uint8)
+    cv2.circle(disk, (radius, radius), radius, 1, -1)
+    clear_disks(free, np.rint(taken).astype(np.int64) - np.array([x, y], np.int64), disk)
     crop = np.ascontiguousarray(image[y : y + height, x : x + width])
     corners = cv2.goodFeaturesToTrack(crop, count, _CORNER_QUALITY, spacing_px, mask=free, blockSize=5)
     if corners is None:

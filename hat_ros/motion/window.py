@@ -2,7 +2,7 @@
 
 The SLAM frame is fixed to the target, its axes those of the first camera, its origin at the target's apparent centre,
 its unit the distance at the start. Frames are kept ever more sparsely with age, because ten neighbours of a slow tumble
-say nothing about depth where sixty frames do (bas-relief ambiguity).
+tell nothing about depth where sixty frames do (bas-relief ambiguity).
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ _YOUNG_FRAMES = 10
 # What is given out catches up with what the window knows of this many frames, by this share of the difference.
 _CATCH_UP_FRAMES, _CATCH_UP_SHARE = 8, 0.3
 _YOUNG_CUTOFFS = (8.0, 4.0, 2.0)
-# A rival solution must be this much cheaper, relative and absolute, to take over.
-_RIVAL_SHARE, _RIVAL_MARGIN = 0.9, 20.0
-_RIVAL_ITERATIONS = 8
+# An alternative solution must be this much cheaper, relative and absolute, to take over.
+_ALTERNATIVE_SHARE, _ALTERNATIVE_MARGIN = 0.9, 20.0
+_ALTERNATIVE_ITERATIONS = 8
 # Turn from which its direction is beyond doubt, and how much of it two opinions that agree may differ by.
 _TELLING_TURN_RAD, _AGREEING_SHARE = np.radians(0.8), 0.75
 # A prior is dropped when the cost without it is lower by this much per observation and is this share of the cost with
@@ -195,33 +195,33 @@ class Window:
 
         Seen from afar, a relief turning one way and its mirror image turning the other way look the same (Necker
         reversal); only perspective and expected points tell them apart, and the descent cannot cross over. Where the
-        tracks leave it open, fused poses that nobody vouches for may still know which way the target turns.
+        tracks leave it open, fused poses that are not TRACKING may still know which way the target turns.
 
         Args:
             since_ns: stamp of a frame of the window.
             turn: (3,) rotation vector of the target in the camera frame from then to the newest frame as fused poses
-                have it, None when they say nothing.
+                have it, None without them.
         """
         k = len(self) // 2
         in_camera = self.points_in_camera(self.R[k], self.t[k])
         nearness = 1.0 / np.maximum(in_camera[:, 2], _MIN_MIRROR_DEPTH)
-        center = float(np.median(nearness[self.seen.any(axis=0)]))
+        center = float(np.median(nearness[self._observed()]))
         # Reversed in inverse depth: to first order the motion of the image is linear in it.
         z = 1.0 / np.clip(2.0 * center - nearness, 0.2 * center, 5.0 * center)
         X = (in_camera * (z * nearness)[:, None] - self.t[k]) @ self.R[k]
-        R, t = self._poses_for(X, self.seen.any(axis=0), k)
+        R, t = self._poses_for(X, self._observed(), k)
         # Guesses were made in the spirit of the solution: they turn with it.
         problem = self._problem(False)._replace(X_expected=X.copy())
-        cost, _ = self._descend((R, t, X), problem, _RIVAL_ITERATIONS)
+        cost, _ = self._descend((R, t, X), problem, _ALTERNATIVE_ITERATIONS)
         if self.trusts_prior:
             # Freed of the prior any structure fits better: the reversed one must beat the present one as free as it is.
             present = self.R.copy(), self.t.copy(), self.X.copy()
-            present_cost, _ = self._descend(present, self._problem(False), _RIVAL_ITERATIONS)
-            if cost < _RIVAL_SHARE * present_cost - _RIVAL_MARGIN:
+            present_cost, _ = self._descend(present, self._problem(False), _ALTERNATIVE_ITERATIONS)
+            if cost < _ALTERNATIVE_SHARE * present_cost - _ALTERNATIVE_MARGIN:
                 self._distrust_for((R, t, X), cost)
             return
-        is_better = cost < _RIVAL_SHARE * self.cost - _RIVAL_MARGIN
-        is_as_good = cost < self.cost / _RIVAL_SHARE + _RIVAL_MARGIN
+        is_better = cost < _ALTERNATIVE_SHARE * self.cost - _ALTERNATIVE_MARGIN
+        is_as_good = cost < self.cost / _ALTERNATIVE_SHARE + _ALTERNATIVE_MARGIN
         if is_better or (is_as_good and turn is not None and self._turns_better(R, since_ns, turn)):
             self.R, self.t, self.X, self.X_guess = R, t, X, X.copy()
 
@@ -237,7 +237,7 @@ class Window:
     def challenge_prior(self) -> None:
         """Stop trusting the prior if the tracks are explained much better without it."""
         state = self.R.copy(), self.t.copy(), self.X.copy()
-        cost, _ = self._descend(state, self._problem(False), _RIVAL_ITERATIONS)
+        cost, _ = self._descend(state, self._problem(False), _ALTERNATIVE_ITERATIONS)
         self._distrust_for(state, cost)
 
     def _distrust_for(self, state: tuple[Float, Float, Float], cost: float) -> None:
@@ -253,7 +253,7 @@ class Window:
         X = np.where(known[:, None], self.X_surface, self.X)
         first = int(np.argmin(np.abs(np.array(self.stamps_ns, dtype=np.int64) - self.look_stamp_ns)))
         R, t = self._poses_for(X, known, first)
-        self._descend((R, t, X), self._problem(True)._replace(R_info=np.zeros(len(self))), _RIVAL_ITERATIONS)
+        self._descend((R, t, X), self._problem(True)._replace(R_info=np.zeros(len(self))), _ALTERNATIVE_ITERATIONS)
         present = self._free_cost(self.R, self.t, self.X)
         allowed = max(present / _TRUST_SHARE, present + _TRUST_LOSS * np.count_nonzero(self.seen))
         if self._free_cost(R, t, X) < allowed:
@@ -264,7 +264,7 @@ class Window:
         """Share of the points in use that lie where the prior expects them (two sigmas); 0 while it is not trusted."""
         if not self.trusts_prior:
             return 0.0
-        known = self.seen.any(axis=0) & (self.n_looks > 0)
+        known = self._observed() & (self.n_looks > 0)
         if np.count_nonzero(known) < _MIN_SHARED_POINTS:
             return 1.0
         offset = np.linalg.norm(self.X[known] - self.X_surface[known], axis=1) * np.sqrt(self.surface_info[known])
@@ -293,6 +293,11 @@ class Window:
         # Of d_1 - A d_0, where A turns one frame's errors into the other's: the trace needs no product but one.
         A, C = self.R[-1] @ self.R[-2].T, self.covariance
         return float(np.sqrt(np.trace(C[:3, :3]) + np.trace(C[6:9, 6:9]) - 2.0 * np.sum(A * C[6:9, :3])))
+
+    def _observed(self) -> Bool:
+        """(N,) which points any frame of the window sees."""
+        observed: Bool = np.any(self.seen, axis=0)
+        return observed
 
     def _poses_for(self, X: Float, known: Bool, first: int) -> tuple[Float, Float]:
         """Poses (W, 3, 3), (W, 3) of all frames from other points (N, 3), those that are known.
@@ -351,7 +356,7 @@ class Window:
         )
 
 
-def rehearse(config: FeatureSlamConfig) -> None:
+def warm_up(config: FeatureSlamConfig) -> None:
     """Put a made-up window through everything that is compiled.
 
     The first use compiles for many seconds on a new machine: the set-up of a stage has time for that, a frame has not.

@@ -9,6 +9,7 @@ E counts edges of the factor graph, n images.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -33,7 +34,7 @@ _ETA_SCALE = 0.01
 class ResidualBlock(nn.Module):
     """Two 3x3 convolutions with a skip; a strided block projects the skip with a 1x1 convolution."""
 
-    def __init__(self, channels_in: int, channels_out: int, norm: type[nn.Module], stride: int) -> None:
+    def __init__(self, channels_in: int, channels_out: int, norm: Callable[[int], nn.Module], stride: int) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(channels_in, channels_out, 3, stride=stride, padding=1)
         self.conv2 = nn.Conv2d(channels_out, channels_out, 3, padding=1)
@@ -52,7 +53,7 @@ class ResidualBlock(nn.Module):
 class Encoder(nn.Module):
     """Image to 1/8 resolution features."""
 
-    def __init__(self, channels_out: int, norm: type[nn.Module]) -> None:
+    def __init__(self, channels_out: int, norm: Callable[[int], nn.Module]) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(3, 32, 7, stride=2, padding=3)
         self.norm1 = norm(32)
@@ -137,7 +138,9 @@ class UpdateOperator(nn.Module):
         self.weight = nn.Sequential(*_head(2), nn.Sigmoid())
         self.agg = Aggregate()
 
-    def forward(self, hidden: Tensor, inp: Tensor, lookup: Tensor, motion: Tensor | None) -> tuple[Tensor, ...]:
+    def forward(
+        self, hidden: Tensor, inp: Tensor, lookup: Tensor, motion: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Refine the flow of every edge.
 
         Args:
@@ -172,6 +175,8 @@ class DroidNet(nn.Module):
         self.cnet = Encoder(2 * FEATURE_CHANNELS, _no_norm)
         self.update = UpdateOperator()
         self.autocast_dtype = autocast
+        self._mean: Tensor
+        self._std: Tensor
         self.register_buffer("_mean", torch.tensor(_MEAN_RGB).view(3, 1, 1), persistent=False)
         self.register_buffer("_std", torch.tensor(_STD_RGB).view(3, 1, 1), persistent=False)
 
@@ -207,7 +212,9 @@ class DroidNet(nn.Module):
             hidden, inp = self.cnet(self._normalised(images_bgr)).split(FEATURE_CHANNELS, dim=1)
             return torch.tanh(hidden).to(self.dtype), F.relu(inp).to(self.dtype)
 
-    def refine(self, hidden: Tensor, inp: Tensor, lookup: Tensor, motion: Tensor | None) -> tuple[Tensor, ...]:
+    def refine(
+        self, hidden: Tensor, inp: Tensor, lookup: Tensor, motion: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """One step of :class:`UpdateOperator` in the network's precision."""
         with self._autocast(hidden):
             hidden, delta, weight = self.update(hidden, inp, lookup, motion)
@@ -299,7 +306,7 @@ class Correlation:
     def append(self, other: Correlation) -> None:
         """Add the edges of another correlation of the same kind."""
         self._n_edges += len(other)
-        if self._volume is not None:
+        if self._volume is not None and other._volume is not None:
             self._volume = [torch.cat(pair) for pair in zip(self._volume, other._volume, strict=True)]
         else:
             self._source = torch.cat([self._source, other._source])

@@ -161,6 +161,8 @@ def bundle_adjust(
         system = _linearise(poses, disparities, intrinsics, target, weight, layout, rule, motion_only)
         if motion_only:
             step = _solve(_damped(system.H, damping), system.b)
+        elif eta is None:
+            raise ValueError("bundle_adjust: depths are free, so their damping (eta) is needed")
         else:
             step, depth_step = _eliminate(system, layout, damping, rule, eta, disparities, sensed)
             disparities = _moved_disparities(disparities, depth_step, layout, rule)
@@ -268,7 +270,7 @@ def _damped(H: Tensor, damping: Damping) -> Tensor:
 def _solve(A: Tensor, b: Tensor) -> Tensor:
     """Cholesky solution of the poses (P, 6): zero if the matrix is not positive definite, NaN if it is not finite.
 
-    NaN is let through, so that whoever reads the poses notices; a step of zero would hide it for good.
+    NaN is let through, so that the caller notices; a step of zero would hide it for good.
     """
     factor, info = torch.linalg.cholesky_ex(A)
     step = torch.cholesky_solve(b.double().reshape(-1, 1), factor).view_as(b)

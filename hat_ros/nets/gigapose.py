@@ -37,6 +37,11 @@ class _AeNet(nn.Module):
 class IstBackbone(nn.Module):
     """The second network's features: (B, 3, 224, 224) crops -> (B, 256, 16, 16)."""
 
+    layer1: nn.Sequential
+    layer2: nn.Sequential
+    layer3: nn.Sequential
+    layer4: nn.Sequential
+
     def __init__(self) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(3, 128, 7, 2, 3, bias=False)

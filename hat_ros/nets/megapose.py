@@ -254,7 +254,7 @@ def score_coarse(
     """Logits of poses by rendering each once: image (3, H, W), K (3, 3), (B, 4, 4) -> (B,)."""
     T = orthonormalise(T_cam_target)
     Ks = K.expand(len(T), 3, 3)
-    boxes = crop_boxes(T, Ks, points.crop, image.shape[1:])
+    boxes = crop_boxes(T, Ks, points.crop, (image.shape[1], image.shape[2]))
     renders = renderer.render_views(T, crop_intrinsics(Ks, boxes))
     return score_renders(net, image, boxes, renders)
 
@@ -291,11 +291,11 @@ def refiner_inputs(
     """
     n = len(T_cam_target)
     Ks = K.expand(n, 3, 3)
-    boxes = crop_boxes(T_cam_target, Ks, points.crop, image.shape[1:])
+    boxes = crop_boxes(T_cam_target, Ks, points.crop, (image.shape[1], image.shape[2]))
     K_crop = crop_intrinsics(Ks, boxes)
     T_views = extra_views(T_cam_target)
     Ks_extra = K.expand(n * (N_VIEWS_REFINER - 1), 3, 3)
     extra = T_views[:, 1:].flatten(0, 1)
-    K_extra = crop_intrinsics(Ks_extra, crop_boxes(extra, Ks_extra, points.views, image.shape[1:]))
+    K_extra = crop_intrinsics(Ks_extra, crop_boxes(extra, Ks_extra, points.views, (image.shape[1], image.shape[2])))
     K_views = torch.cat([K_crop[:, None], K_extra.reshape(n, N_VIEWS_REFINER - 1, 3, 3)], dim=1)
     return K_crop, roi_align(image, boxes), T_views, K_views

@@ -45,6 +45,13 @@ class _Fusion(nn.Module):
 
 
 class _Scratch(nn.Module):
+    layer2_rn: nn.Conv2d
+    layer3_rn: nn.Conv2d
+    layer4_rn: nn.Conv2d
+    refinenet2: _Fusion
+    refinenet3: _Fusion
+    refinenet4: _Fusion
+
     def __init__(self, widths: tuple[int, ...]) -> None:
         super().__init__()
         for index, width in enumerate(widths, start=1):

@@ -66,6 +66,11 @@ class ResNet34(nn.Module):
         pre_activation: the 5x5-stem layout without the closing linear layer.
     """
 
+    layer1: nn.Sequential
+    layer2: nn.Sequential
+    layer3: nn.Sequential
+    layer4: nn.Sequential
+
     def __init__(self, n_channels: int, pre_activation: bool = False) -> None:
         super().__init__()
         stem, block = (5, PreActivationBlock) if pre_activation else (7, BasicBlock)

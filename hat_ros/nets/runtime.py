@@ -47,7 +47,8 @@ class Runtime:
     def place(self, net: torch.nn.Module) -> Callable[..., Any]:
         """The network on the device, for inference only, and :meth:`wrap` around it."""
         # Channels last: what convolutions are fastest in, an eighth on the CPU and more on tensor cores.
-        net = net.to(self.device, memory_format=torch.channels_last)
+        # torch documents the argument, its declared overloads lack it.
+        net = net.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         return self.wrap(net.eval().requires_grad_(False))
 
     def wrap(self, net: torch.nn.Module) -> Callable[..., Any]:

@@ -32,8 +32,8 @@ def refine_outline(rgb: UInt8, mask: UInt8, band_px: int, contrast: float) -> UI
         (h, w) uint8 of 0 and 1.
     """
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * band_px + 1, 2 * band_px + 1))
-    inner = cv2.erode(mask, kernel, borderType=cv2.BORDER_REPLICATE)
-    outer = cv2.dilate(mask, kernel, borderType=cv2.BORDER_REPLICATE)
+    inner = np.asarray(cv2.erode(mask, kernel, borderType=cv2.BORDER_REPLICATE), np.uint8)
+    outer = np.asarray(cv2.dilate(mask, kernel, borderType=cv2.BORDER_REPLICATE), np.uint8)
     open_xy = cv2.findNonZero(inner ^ outer)
     if open_xy is None:
         return mask
@@ -43,15 +43,14 @@ def refine_outline(rgb: UInt8, mask: UInt8, band_px: int, contrast: float) -> UI
         step = 2
     inside, outside = _area_table(examples, known_inside), _area_table(examples, known_outside)
     reach, least = (2 * band_px + 2) // step, max(1, _MIN_PIXELS // step**2)
-    moved = _decide(
-        rgb, mask, open_xy.reshape(-1, 2), *inside, *outside, step, reach, least, np.float32(contrast * contrast)
-    )
+    at = np.asarray(open_xy, np.int32).reshape(-1, 2)
+    moved = _decide(rgb, mask, at, *inside, *outside, step, reach, least, np.float32(contrast * contrast))
     # A lone pixel that disagrees with most of its neighbours is noise.
     smooth = cv2.medianBlur(moved, 3)
     return np.where(inner == outer, mask, smooth)
 
 
-def rehearse() -> None:
+def warm_up() -> None:
     """Move a made-up outline, so that everything is compiled before the first frame comes."""
     mask = np.zeros((16, 16), np.uint8)
     mask[4:12, 4:12] = 1
@@ -61,28 +60,43 @@ def rehearse() -> None:
 def _every_second(image: UInt8) -> UInt8:
     """Every second pixel of every second row of an (h, w, ...) image, an odd rest dropped."""
     h, w = image.shape[0] // 2, image.shape[1] // 2
-    return cv2.resize(image[: 2 * h, : 2 * w], (w, h), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(cv2.resize(image[: 2 * h, : 2 * w], (w, h), interpolation=cv2.INTER_NEAREST), np.uint8)
 
 
 def _area_table(rgb: UInt8, mask: UInt8) -> tuple[Int32, Int32]:
     """Summed-area tables (h + 1, w + 1) of a 0/1 mask and (h + 1, w + 1, 3) of the colours in it."""
-    return cv2.integral(mask, sdepth=cv2.CV_32S), cv2.integral(cv2.copyTo(rgb, mask), sdepth=cv2.CV_32S)
+    count = cv2.integral(mask, sdepth=cv2.CV_32S)
+    colour = cv2.integral(cv2.copyTo(rgb, mask), sdepth=cv2.CV_32S)
+    return np.asarray(count, np.int32), np.asarray(colour, np.int32)
 
 
 @njit(cache=True, nogil=True)
-def _box_sum(table, x0, y0, x1, y1):  # noqa: ANN001, ANN202 - compiled
+def _box_sum(table: Int32, x0: int, y0: int, x1: int, y1: int) -> np.float32:
     """Sum over a half-open box; right even where a large table has wrapped around."""
     return np.float32(np.int32(table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0]))
 
 
 @njit(cache=True, nogil=True)
-def _color_sum(table, x0, y0, x1, y1, c):  # noqa: ANN001, ANN202 - compiled
+def _color_sum(table: Int32, x0: int, y0: int, x1: int, y1: int, c: int) -> np.float32:
     """The same of one colour."""
     return np.float32(np.int32(table[y1, x1, c] - table[y0, x1, c] - table[y1, x0, c] + table[y0, x0, c]))
 
 
 @njit(cache=True, nogil=True)
-def _decide(rgb, mask, open_xy, n_inside, inside, n_outside, outside, step, reach, least, contrast_sq):  # noqa: ANN001, ANN202 - compiled
+def _decide(
+    rgb: UInt8,
+    mask: UInt8,
+    open_xy: Int32,
+    n_inside: Int32,
+    inside: Int32,
+    n_outside: Int32,
+    outside: Int32,
+    step: int,
+    reach: int,
+    least: int,
+    contrast_sq: np.float32,
+) -> UInt8:
+    """A mask with its open pixels (n, 2) decided anew, from the area tables of both sides."""
     out = mask.copy()
     h, w = n_inside.shape[0] - 1, n_inside.shape[1] - 1
     for i in range(len(open_xy)):

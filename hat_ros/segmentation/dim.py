@@ -33,15 +33,15 @@ def with_dim_parts(measured: Sky, lit: Mask) -> Mask:
     reach = round(_REACH_SHARE * max(w, h)) + _REACH_PX
     box = np.s_[max(0, y - reach) : y + h + reach, max(0, x - reach) : x + w + reach]
     mean3, step = measured.mean3[box], measured.threshold - measured.level
-    bright = cv2.threshold(mean3, measured.level + _BRIGHT_STEPS * step, 1, cv2.THRESH_BINARY)[1]
-    seen = cv2.threshold(mean3, measured.threshold, 1, cv2.THRESH_BINARY)[1]
-    factor = -(-max(seen.shape) // _WORK_SIDE_PX)
+    bright = _above(mean3, measured.level + _BRIGHT_STEPS * step)
+    above = _above(mean3, measured.threshold)
+    factor = -(-max(above.shape) // _WORK_SIDE_PX)
     luma = _reduced(measured.luma[box], factor)
     ladder = [known for width in _WIDTHS_PX if (known := _noise(measured.luma, width, factor)) is not None]
-    dim = _find(luma, _reduced(bright, factor) > 0, _reduced(seen, factor) > 0.5, step, ladder)
+    dim = _find(luma, _reduced(bright, factor) > 0, _reduced(above, factor) > 0.5, step, ladder)
     if not dim.any():
         return lit
-    seen = seen.astype(np.uint8)
+    seen = above.astype(np.uint8)
     dim = enlarge(dim, (seen.shape[1], seen.shape[0]))
     count, piece = cv2.connectedComponents(dim | seen | lit[box], connectivity=8)
     hangs_on = np.bincount(piece[lit[box] > 0], minlength=count) > 0
@@ -62,7 +62,7 @@ def _find(
 
     Args:
         luma: (h, w) reduced part of the image.
-        bright: (h, w) what says nothing about its neighbours.
+        bright: (h, w) what tells nothing about its neighbours.
         seen: (h, w) what single pixels show to be no sky, ``step`` above it.
         step: in grey levels.
         ladder: width, level of the sky and threshold above it of each mean, narrow ones first.
@@ -70,9 +70,8 @@ def _find(
     Returns:
         (h, w) uint8 of 0 and 1.
     """
-    bright = bright.astype(np.uint8)
-    free = (cv2.dilate(bright, _disc(_MARGIN_PX)) == 0).astype(np.float32)
-    found = np.zeros_like(bright)
+    free = (cv2.dilate(bright.view(np.uint8), _disc(_MARGIN_PX)) == 0).astype(np.float32)
+    found = np.zeros(bright.shape, np.uint8)
     for n, level, threshold in ladder:
         if threshold >= step:
             continue
@@ -81,7 +80,7 @@ def _find(
         mean = cv2.boxFilter(values.astype(np.float32) * free, -1, (n, n))  # times the share
         # Fewer pixels have more noise.
         more = ((share > _MIN_FREE) & (mean > threshold * np.sqrt(share))).astype(np.uint8)
-        found |= cv2.morphologyEx(more, cv2.MORPH_OPEN, _disc(max(1, int(_BODY_SHARE * n))))
+        found |= np.asarray(cv2.morphologyEx(more, cv2.MORPH_OPEN, _disc(max(1, int(_BODY_SHARE * n)))), np.uint8)
         seen = seen | (found > 0)
         step = threshold
     return found
@@ -111,9 +110,16 @@ def _reduced(image: UInt8 | Float32, factor: int, whole: bool = False) -> Float3
     if whole:
         size = (image.shape[1] // factor, image.shape[0] // factor)
         image = image[: size[1] * factor, : size[0] * factor]
-    image = image.astype(np.float32, copy=False)
-    return image if factor == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    values = image.astype(np.float32, copy=False)
+    if factor == 1:
+        return values
+    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _above(image: Float32, level: float) -> Float32:
+    """1 where an image lies above a level, else 0."""
+    return np.asarray(cv2.threshold(image, level, 1, cv2.THRESH_BINARY)[1], np.float32)
 
 
 def _disc(radius_px: int) -> UInt8:
-    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius_px + 1, 2 * radius_px + 1))
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius_px + 1, 2 * radius_px + 1)), np.uint8)

@@ -76,7 +76,7 @@ def fades_out(measured: Sky, region: Mask) -> bool:
     around = measured.mean3[box][near != far]
     half = 0.5 * (measured.level + measured.threshold)
     most = _MAX_SOFT_SHARE_CUT if touches_border(region) else _MAX_SOFT_SHARE
-    return np.count_nonzero(around > half) > most * len(around)
+    return bool(np.count_nonzero(around > half) > most * len(around))
 
 
 def without_glow(rgb: UInt8) -> UInt8:
@@ -87,7 +87,7 @@ def without_glow(rgb: UInt8) -> UInt8:
     small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     known = cv2.erode(_smooth_from_border(small), np.ones((3, 3), np.uint8)).astype(np.float32)
     glow = cv2.resize(_continued(small, known), (w, h), interpolation=cv2.INTER_LINEAR)
-    return cv2.subtract(rgb, glow - _PEDESTAL, dtype=cv2.CV_8U)
+    return np.asarray(cv2.subtract(rgb, glow - _PEDESTAL, dtype=cv2.CV_8U), np.uint8)
 
 
 def _smooth_from_border(image: Float32) -> Mask:
@@ -113,5 +113,5 @@ def _continued(image: Float32, known: Float32) -> Float32:
     half = ((w + 1) // 2, (h + 1) // 2)
     weight = cv2.pyrDown(known, dstsize=half)
     reduced = cv2.pyrDown(image * known[..., None], dstsize=half) / np.maximum(weight, 1e-6)[..., None]
-    below = _continued(reduced, (weight > 1e-3).astype(np.float32))
+    below = _continued(reduced.astype(np.float32, copy=False), (weight > 1e-3).astype(np.float32))
     return np.where(known[..., None] > 0, image, cv2.pyrUp(below, dstsize=(w, h)))

@@ -4,7 +4,7 @@ The ground shifts through the image as a whole, by a homography from frame to fr
 the target. Earlier frames carried along by it say what each pixel would look like without the target. Where all of
 them disagree with the image stands something else; where the image is what they say, from so far back that the target
 was elsewhere, there is ground. Neither owes anything to the colours of the target, so that a part that turns into view
-is found although nobody has seen its colour.
+is found although its colour has never been seen.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _MAX_SHIFT = 0.6  # of a window: what was beyond is hardly in view any more
 _STEP = 10  # 8-bit colour difference that counts
 _SAME = 4  # and one that does not
 _ALL_AROUND = 0.85  # share of a mask and its surroundings where the ground is known, for it to be beyond doubt
-_VOUCHED = 0.85  # overlap with what is unlike the ground
+_CONFIRMED = 0.85  # overlap with what is unlike the ground
 _SHOWN = 0.3  # share of a mask that is unlike the ground
 _CONTRADICTED = 0.5  # share that is ground
 CLEAR = 0.9  # from so many lengths back none of the target is where it is now
@@ -62,19 +62,20 @@ class GroundEvidence:
     ground: Mask
     known: Mask
 
-    def vouches_for(self, mask: Mask) -> bool:
+    def confirms(self, mask: Mask) -> bool:
         """Whether a 0/1 mask is what stands before the ground, all around which that is known."""
-        around = cv2.dilate(mask, _K5)
-        known_around = np.count_nonzero(around & self.known) >= _ALL_AROUND * np.count_nonzero(around)
-        return known_around and overlap(mask & self.known, self.target) >= _VOUCHED
+        around = np.asarray(cv2.dilate(mask, _K5), np.uint8)
+        if np.count_nonzero(around & self.known) < _ALL_AROUND * np.count_nonzero(around):
+            return False
+        return overlap(mask & self.known, self.target) >= _CONFIRMED
 
     def shows(self, mask: Mask) -> bool:
         """Whether much of a 0/1 mask is seen to stand before the ground."""
-        return np.count_nonzero(mask & self.target) >= _SHOWN * np.count_nonzero(mask)
+        return bool(np.count_nonzero(mask & self.target) >= _SHOWN * np.count_nonzero(mask))
 
     def contradicts(self, mask: Mask) -> bool:
         """Whether most of a 0/1 mask is ground."""
-        return np.count_nonzero(mask & self.ground) > _CONTRADICTED * np.count_nonzero(mask)
+        return bool(np.count_nonzero(mask & self.ground) > _CONTRADICTED * np.count_nonzero(mask))
 
 
 @dataclass
@@ -108,15 +109,15 @@ class GroundMemory:
         """
         whole = Window.whole(rgb, _SIDE_PX)
         small = whole.rgb
-        grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
+        grey = np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), np.uint8)
         if self._grey is not None and self._grey.shape == grey.shape:
             if mask_before is not None:
                 size = (small.shape[1], small.shape[0])
                 covered = cv2.resize(mask_before * 255, size, interpolation=cv2.INTER_AREA) > 0
-                self._frames[-1].free = 1 - cv2.dilate(covered.astype(np.uint8), _K5)
+                self._frames[-1].free = np.asarray(1 - cv2.dilate(covered.astype(np.uint8), _K5), np.uint8)
             else:
                 self._points = _NO_POINTS  # they may have been the target's
-            self._carry(self._follow(grey))
+            self._carry(self._follow(self._grey, grey), grey.shape)
         else:
             self._frames, self._H_now_then, self._points = [], _NO_MOTION, _NO_POINTS
         self._frames.append(_Remembered(small, np.ones(grey.shape, np.uint8)))
@@ -125,7 +126,7 @@ class GroundMemory:
         self._scale = (small.shape[1] / rgb.shape[1], small.shape[0] / rgb.shape[0])
         return whole
 
-    def _follow(self, grey: UInt8) -> Float | None:
+    def _follow(self, before: UInt8, grey: UInt8) -> Float | None:
         """(3, 3) homography that most point tracks follow into the next frame outside the target; None without one."""
         free, points = self._frames[-1].free, self._points
         if len(points):
@@ -134,14 +135,16 @@ class GroundMemory:
             points = points[inside]
             points = points[free[y[inside], x[inside]] > 0]
         if len(points) <= max(_MIN_POINTS, _FEW_POINTS * self._n_chosen):
-            corners = cv2.goodFeaturesToTrack(self._grey, _MAX_POINTS, _POINT_QUALITY, _POINT_SPACING_PX, mask=free)
-            points = _NO_POINTS if corners is None else corners.reshape(-1, 2)
+            corners = cv2.goodFeaturesToTrack(before, _MAX_POINTS, _POINT_QUALITY, _POINT_SPACING_PX, mask=free)
+            points = _NO_POINTS if corners is None else np.asarray(corners, np.float32).reshape(-1, 2)
             self._n_chosen = len(points)
         self._points = _NO_POINTS
         if len(points) < _MIN_POINTS:
             return None
         patch = (_TRACK_PX, _TRACK_PX)
-        tracked, found, _ = cv2.calcOpticalFlowPyrLK(self._grey, grey, points, None, winSize=patch, maxLevel=2)
+        guess = points.copy()  # not used, but the signature wants one
+        ahead, found, _ = cv2.calcOpticalFlowPyrLK(before, grey, points, guess, winSize=patch, maxLevel=2)
+        tracked = np.asarray(ahead, np.float32)
         good = found.ravel() == 1
         if np.count_nonzero(good) < _MIN_POINTS:
             return None
@@ -149,15 +152,15 @@ class GroundMemory:
         if H is None or follows.mean() < _MIN_FOLLOWING:
             return None
         self._points = tracked[good][follows.ravel() == 1]
-        return H
+        return np.asarray(H, np.float64)
 
-    def _carry(self, H_next_prev: Float | None) -> None:
+    def _carry(self, H_next_prev: Float | None, shape: tuple[int, ...]) -> None:
         """Take the next frame's view; forget what is too close to its neighbour, or all where the ground was lost."""
         if H_next_prev is None:
             self._frames, self._H_now_then = [], _NO_MOTION
             return
         H = H_next_prev @ self._H_now_then
-        height, width = self._grey.shape
+        height, width = shape
         if len(H) >= 2:
             (x0, y0), (x1, y1) = _carried(H[-2:], (width / 2, height / 2))
             if math.hypot(x1 - x0, y1 - y0) < _SPACING_PX:
@@ -188,7 +191,7 @@ class GroundMemory:
             far_least, far_known = _least(clear)
             least, known = np.where(far_known > 0, far_least, least), known | far_known
             ground = ((far_least <= _SAME) & (far_known > 0)).astype(np.uint8)
-        target = cv2.medianBlur(((least > _STEP) & (known > 0)).astype(np.uint8), 3)
+        target = np.asarray(cv2.medianBlur(((least > _STEP) & (known > 0)).astype(np.uint8), 3), np.uint8)
         return GroundEvidence(target, ground & (1 - target), known)
 
     def length_known_px(self, window: Window) -> float:
@@ -241,7 +244,7 @@ def _least(changes: list[tuple[UInt8, Mask]]) -> tuple[UInt8, Mask]:
     least = np.full(changes[0][0].shape, 255, np.uint8)
     count = np.zeros_like(least)
     for change, seen in changes:
-        least = cv2.min(least, cv2.max(change, 255 * (1 - seen)))
+        least = np.minimum(least, np.maximum(change, 255 * (1 - seen)))
         count += seen
     return least, (count >= min(2, len(changes))).astype(np.uint8)
 
@@ -255,4 +258,5 @@ def _compare(now: UInt8, then: _Remembered, H: Float) -> tuple[UInt8, UInt8]:
     above = cv2.subtract(now, cv2.dilate(ground, _K3))
     below = cv2.subtract(cv2.erode(ground, _K3), now)
     red, green, blue = cv2.split(cv2.max(above, below))
-    return cv2.max(cv2.max(red, green), blue), cv2.erode(seen, _K3, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    clear = cv2.erode(seen, _K3, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    return np.asarray(cv2.max(cv2.max(red, green), blue), np.uint8), np.asarray(clear, np.uint8)

@@ -14,8 +14,8 @@ from hat_ros.segmentation.shape import SilhouetteBank
 
 # A second bright region with this share of the largest makes the choice a question; less where the border cuts the
 # largest, which may then be a planet.
-_RIVAL_SHARE = 0.2
-_RIVAL_SHARE_CUT = 0.03
+_COMPETING_SHARE = 0.2
+_COMPETING_SHARE_CUT = 0.03
 _SAME_SHARE = 0.6  # of a region lies where the target was
 _MAX_GROWTH = 1.6  # of the target's area from one frame to the next
 _MIN_LIT_SHAPE = 0.5  # shape overlap of the lit part of a target
@@ -48,12 +48,12 @@ class LitBody:
         """
         sizes = [np.count_nonzero(r) for r in regions]
         cut = touches_border(regions[0])
-        rivals = [i for i, size in enumerate(sizes) if size >= (_RIVAL_SHARE_CUT if cut else _RIVAL_SHARE) * sizes[0]]
-        main: int | None = 0
-        if cut or len(rivals) > 1:
-            main = self._choose(regions, rivals, before, silhouette)
-            if main is None:
-                return None
+        competing = [
+            i for i, size in enumerate(sizes) if size >= (_COMPETING_SHARE_CUT if cut else _COMPETING_SHARE) * sizes[0]
+        ]
+        main = self._choose(regions, competing, before, silhouette) if cut or len(competing) > 1 else 0
+        if main is None:
+            return None
         bright = sky.join_parts(regions, main)
         lit = with_dim_parts(measured, bright)
         body = self._complete(lit, sky.lit_share(bright))
@@ -62,7 +62,7 @@ class LitBody:
         return body
 
     def _choose(
-        self, regions: list[Mask], rivals: list[int], before: Mask | None, silhouette: Mask | None
+        self, regions: list[Mask], competing: list[int], before: Mask | None, silhouette: Mask | None
     ) -> int | None:
         """Which bright region is the target: the one that is where it was, or else the one with its shape.
 
@@ -71,18 +71,18 @@ class LitBody:
         """
         for known in (before, silhouette):
             if known is not None:
-                shared = {i: np.count_nonzero(regions[i] & known) for i in rivals}
-                most = max(rivals, key=lambda i: shared[i])
+                shared = {i: np.count_nonzero(regions[i] & known) for i in competing}
+                most = max(competing, key=lambda i: shared[i])
                 size = np.count_nonzero(regions[most])
                 if shared[most] >= _SAME_SHARE * size and size <= _MAX_GROWTH * np.count_nonzero(known):
                     return most
-        shape = {i: self._bank.overlap(shrink(regions[i], self._config.cold_side_px).astype(bool)) for i in rivals}
-        whole = [i for i in rivals if not touches_border(regions[i])]
+        shape = {i: self._bank.overlap(shrink(regions[i], self._config.cold_side_px).astype(bool)) for i in competing}
+        whole = [i for i in competing if not touches_border(regions[i])]
         best = max(whole, key=lambda i: shape[i], default=None)
-        if best is not None and (shape[best] >= _MIN_LIT_SHAPE or len(whole) == len(rivals)):
+        if best is not None and (shape[best] >= _MIN_LIT_SHAPE or len(whole) == len(competing)):
             return best
         required = self._config.min_shape_overlap + CUT_SURCHARGE
-        cut = [i for i in rivals if shape[i] >= required and border_contact(regions[i]) <= _MAX_CONTACT]
+        cut = [i for i in competing if shape[i] >= required and border_contact(regions[i]) <= _MAX_CONTACT]
         return max((i for i in cut if i not in whole), key=lambda i: shape[i], default=best)
 
     def _complete(self, lit: Mask, lit_share: float) -> Mask:
@@ -109,7 +109,7 @@ class LitBody:
 def _explains(silhouette: Mask, lit: Mask, body: Mask) -> bool:
     """Whether what is lit lies inside the predicted silhouette and is spread over it: the rest of it is shadow."""
     inside = np.count_nonzero(silhouette & lit) >= 0.95 * np.count_nonzero(lit)
-    return inside and np.count_nonzero(silhouette & body) >= 0.5 * np.count_nonzero(silhouette)
+    return bool(inside and np.count_nonzero(silhouette & body) >= 0.5 * np.count_nonzero(silhouette))
 
 
 def _shadowed(silhouette: Mask, lit: Mask) -> Mask:

@@ -40,7 +40,9 @@ class Mask2FormerSegmenter:
         self._runtime = Runtime(config.nets)
         folder = find("mask2former", config.nets.weights_folder or None)
         self._processor, model = _load(folder)
-        self._model = model.to(self._runtime.device).eval().requires_grad_(False)
+        # The library's decorator hides what the method takes.
+        model = model.to(self._runtime.device)  # type: ignore[arg-type]
+        self._model = model.eval().requires_grad_(False)
         self._previous: Bool | None = None
 
     @torch.inference_mode()
@@ -129,7 +131,7 @@ def choose(
 
 
 def _compactness(mask: Bool) -> float:
-    points = cv2.findNonZero(mask.astype(np.uint8))
+    points = cv2.findNonZero(mask.astype(np.uint8)).reshape(-1, 2)
     hull = cv2.contourArea(cv2.convexHull(points))
     return min(np.count_nonzero(mask) / max(hull, 1.0), 1.0)
 

@@ -36,8 +36,8 @@ def border_contact(mask: Mask) -> float:
 def fill_holes(mask: Mask, max_share: float) -> Mask:
     """Fill enclosed holes smaller than a share of the mask's area: dark details, not gaps between parts."""
     contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
-    holes = np.flatnonzero(hierarchy[0, :, 3] >= 0) if hierarchy is not None else ()
-    if not len(holes):
+    holes = [] if hierarchy is None else np.flatnonzero(hierarchy[0, :, 3] >= 0).tolist()
+    if not holes:
         return mask
     out = mask.copy()
     limit = max_share * np.count_nonzero(mask)
@@ -83,8 +83,8 @@ def _reduced(rgb: UInt8, size: tuple[int, int]) -> UInt8:
     """A picture at a smaller size (width, height) by area; halving first is several times faster."""
     h, w = rgb.shape[:2]
     if min(w // size[0], h // size[1]) >= 4 and w % 2 == h % 2 == 0:
-        rgb = cv2.resize(rgb, (w // 2, h // 2), interpolation=cv2.INTER_AREA)
-    return cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+        rgb = np.asarray(cv2.resize(rgb, (w // 2, h // 2), interpolation=cv2.INTER_AREA), np.uint8)
+    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 @dataclass(frozen=True)

@@ -42,19 +42,20 @@ class MotionEvidence:
 
     def found_share(self, mask: UInt8) -> float:
         """Share of what moves that a 0/1 mask contains, or has close by: what a target uncovers moves too."""
-        return np.count_nonzero(self.moving & cv2.dilate(mask, _K7)) / np.count_nonzero(self.moving)
+        around = np.asarray(cv2.dilate(mask, _K7), np.uint8)
+        return np.count_nonzero(self.moving & around) / np.count_nonzero(self.moving)
 
     def still_share(self, mask: UInt8) -> float:
         """Share of a 0/1 mask, outline left out, that is background texture."""
-        inside = cv2.erode(mask, _K5, borderType=cv2.BORDER_REPLICATE)
-        return np.count_nonzero(self.still & inside) / max(1, np.count_nonzero(inside))
+        inside = np.asarray(cv2.erode(mask, _K5, borderType=cv2.BORDER_REPLICATE), np.uint8)
+        return np.count_nonzero(self.still & inside) / max(1, int(np.count_nonzero(inside)))
 
 
 class MotionDetector:
     """Remembers reduced frames and finds what moved against the background.
 
     Args:
-        side_px: longer side of the image that is searched; larger frames are reduced once somebody asks.
+        side_px: longer side of the image that is searched; larger frames are reduced on demand.
     """
 
     def __init__(self, side_px: int) -> None:
@@ -76,10 +77,12 @@ class MotionDetector:
         far, far_change = _compare(now, long_before)
         near, _ = _compare(now, before)
         # Where the target was before differs too, but hardly in the same place at both lags.
-        moving = cv2.medianBlur((np.minimum(far, near) > _MIN_STEP).astype(np.uint8), 3)
+        moving = np.asarray(cv2.medianBlur((np.minimum(far, near) > _MIN_STEP).astype(np.uint8), 3), np.uint8)
         size = 2 * max(1, round(0.02 * max(now.shape))) + 1
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-        moving = cv2.morphologyEx(moving, cv2.MORPH_CLOSE, kernel, borderType=cv2.BORDER_REPLICATE)
+        moving = np.asarray(
+            cv2.morphologyEx(moving, cv2.MORPH_CLOSE, kernel, borderType=cv2.BORDER_REPLICATE), np.uint8
+        )
         if not 8 <= np.count_nonzero(moving) <= _MAX_SHARE * moving.size:
             return None
         contrast = cv2.subtract(cv2.dilate(now, _K3), cv2.erode(now, _K3)).max(axis=2)

@@ -27,7 +27,7 @@ _BRIDGED_PX = (2, 4, 7, 11)
 _PICTURE_SIDE_PX = 320
 _SPECK_PX = 25  # area of an outline with its neighbours below which it is noise, a star or a wave ...
 _MIN_AREA_PX = 60  # ... and of a target
-_FEW = 20  # fewer sharp pixels say nothing
+_FEW = 20  # fewer sharp pixels tell nothing
 _BESIDE_PX = 2  # outlines lie on both sides of a mask's own
 
 _K3 = np.ones((3, 3), np.uint8)
@@ -62,7 +62,8 @@ class SharpOutlines:
         if total < _FEW:
             return None
         side = 2 * _BESIDE_PX + 1
-        held = np.count_nonzero(self._judged & cv2.dilate(mask, np.ones((side, side), np.uint8)))
+        around = np.asarray(cv2.dilate(mask, np.ones((side, side), np.uint8)), np.uint8)
+        held = np.count_nonzero(self._judged & around)
         return held / total - np.count_nonzero(mask) / mask.size
 
     def cuts(self) -> list[Mask]:
@@ -85,14 +86,14 @@ class SharpOutlines:
         margin = int(radii[-1]) + 1
         padded = cv2.copyMakeBorder(1 - sharp, *(margin,) * 4, cv2.BORDER_CONSTANT, value=1)
         distance = cv2.distanceTransform(padded, cv2.DIST_L2, 3)
-        out = []
+        out: list[Mask | None] = []
         for radius in radii:
             grown = (distance <= radius).astype(np.uint8)
             closed = cv2.distanceTransform(grown, cv2.DIST_L2, 3)[margin:-margin, margin:-margin] > radius
-            body = fill_holes(closed.astype(np.uint8), np.inf)
-            body = tidy(cv2.morphologyEx(body, cv2.MORPH_OPEN, _K3), None)
-            large = body is not None and np.count_nonzero(body) >= _MIN_AREA_PX * self._scale**2
-            out.append(self._reduced(body) if large else None)
+            filled = fill_holes(closed.astype(np.uint8), np.inf)
+            body = tidy(np.asarray(cv2.morphologyEx(filled, cv2.MORPH_OPEN, _K3), np.uint8), None)
+            small = body is None or np.count_nonzero(body) < _MIN_AREA_PX * self._scale**2
+            out.append(None if body is None or small else self._reduced(body))
         return out
 
     def _reduced(self, mask: Mask) -> Mask:

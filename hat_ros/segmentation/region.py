@@ -22,6 +22,7 @@ _MOTION_REACH = 0.6  # of the size of what moved: how far beyond it the target m
 _CLOSED_SHORT = 0.5  # of its length: how far before the border a closed cut of what that cuts off may end
 _OPEN_BESIDE = 0.25  # of what is known of the target: how far beyond its extent a side opens
 
+_NO_BOX = (0, 0, 0, 0)  # GrabCut starts from labels instead
 _K3 = np.ones((3, 3), np.uint8)
 
 
@@ -50,12 +51,12 @@ class ColorModels:
 class ClearCut:
     """A reduced (h, w) 0/1 mask with the colour step across its outline (see :func:`edge_contrast`).
 
-    ``vouched`` for by the ground behind it, or not.
+    ``confirmed`` by the ground behind it, or not.
     """
 
     mask: Mask
     contrast: float
-    vouched: bool = False
+    confirmed: bool = False
 
 
 def graph_cut(rgb: UInt8, labels: Mask, models: ColorModels, iterations: int) -> Mask | None:
@@ -66,8 +67,8 @@ def graph_cut(rgb: UInt8, labels: Mask, models: ColorModels, iterations: int) ->
     labels = labels.copy()
     mode = cv2.GC_EVAL if models.learned else cv2.GC_INIT_WITH_MASK
     cv2.setRNGSeed(0)  # its k-means draws from OpenCV's global generator
-    cv2.grabCut(rgb, labels, None, models.background, models.foreground, iterations, mode)
-    return labels & 1
+    cv2.grabCut(rgb, labels, _NO_BOX, models.background, models.foreground, iterations, mode)
+    return labels & np.uint8(1)
 
 
 def cut_from_seeds(
@@ -89,7 +90,7 @@ def cut_from_seeds(
     every = np.minimum.reduce(seeds)
     some = np.maximum.reduce(seeds)
     sure = cv2.erode(every, kernel, borderType=cv2.BORDER_REPLICATE)
-    maybe = cv2.dilate(some, kernel)
+    maybe = np.asarray(cv2.dilate(some, kernel), np.uint8)
     labels = np.where(maybe > 0, np.where(seeds[0] > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD), cv2.GC_BGD)
     labels = np.where(sure > 0, cv2.GC_FGD, labels).astype(np.uint8)
     if seen is not None:
@@ -217,4 +218,4 @@ def color_step(rgb: UInt8) -> Float32:
     """Colour step (8-bit, across two pixels) at each pixel of an (h, w, 3) image."""
     dx = cv2.Sobel(rgb, cv2.CV_32F, 1, 0, ksize=3, scale=0.25)
     dy = cv2.Sobel(rgb, cv2.CV_32F, 0, 1, ksize=3, scale=0.25)
-    return cv2.sqrt(cv2.transform(dx * dx + dy * dy, np.ones((1, 3))))
+    return np.asarray(cv2.sqrt(cv2.transform(dx * dx + dy * dy, np.ones((1, 3)))), np.float32)

@@ -23,7 +23,7 @@ from hat_ros.segmentation.shape import SilhouetteBank
 MIN_CONTRAST = 8.0  # 8-bit colour step across the outline below which there is no outline
 OPEN_BETTER = 0.012  # plausibility by which a cut that takes a liberty must beat the one that does not
 AGREEMENT = 0.8  # overlap of two independent masks that mean the same target
-_GLANCE_ITERATIONS = 1  # of a cut that is only to agree so far
+_CHECK_ITERATIONS = 1  # of a cut that is only to agree so far
 # A target contains most of what moves against the background, and hardly any texture that moves with it. Every
 # hundredth short of that costs a hundredth of shape overlap; ...
 _MIN_FOUND = 0.6
@@ -62,7 +62,7 @@ class Found:
 
 @dataclass(frozen=True)
 class _Newest:
-    """The newest frame at the scale of a search, reduced once somebody asks."""
+    """The newest frame at the scale of a search, reduced on demand."""
 
     rgb: UInt8
     remembered: Window
@@ -130,9 +130,9 @@ class Search:
         kind = kinds[self._turn // 2 % len(kinds)]
         self._turn += 1
         if motion is not None:
-            cut = region.cut_from_motion(self._newest.window.rgb, motion.moving, _GLANCE_ITERATIONS)
+            cut = region.cut_from_motion(self._newest.window.rgb, motion.moving, _CHECK_ITERATIONS)
         else:
-            cut = region.cut_from_nothing(self._newest.window.rgb, kind, small, _GLANCE_ITERATIONS)
+            cut = region.cut_from_nothing(self._newest.window.rgb, kind, small, _CHECK_ITERATIONS)
         return cut is not None and overlap(cut, small) >= AGREEMENT
 
     def find(self, rgb: UInt8, open_sides: tuple[str, ...]) -> Found | None:
@@ -214,7 +214,7 @@ class Search:
         if seen is None:
             return None
         kernel = np.ones((_GAP_PX, _GAP_PX), np.uint8)
-        joined = cv2.morphologyEx(seen.target, cv2.MORPH_CLOSE, kernel)
+        joined = np.asarray(cv2.morphologyEx(seen.target, cv2.MORPH_CLOSE, kernel), np.uint8)
         pieces = [piece for piece in (region.tidy(joined, None), region.tidy(joined, joined)) if piece is not None]
         piece = max(pieces, key=self._shape, default=None)
         if piece is None:
@@ -232,7 +232,7 @@ class Search:
         cut = region.cut_from_seeds(
             window.rgb, [window.reduce(whole.enlarge(piece))], margin * window.scale, models, seen
         )
-        if cut is None or not seen.vouches_for(cut):
+        if cut is None or not seen.confirms(cut):
             return None
         plausibility = self._shape(cut)
         if plausibility < self._config.min_shape_overlap - _GROUND_RELIEF:

@@ -77,7 +77,7 @@ class SilhouetteBank:
         """Area (views, angles) that a polar image shares with every silhouette at every angle."""
         spectrum = np.fft.rfft(polar, axis=-1).astype(np.complex64)
         shared = np.matmul(self._spectra, spectrum.T[:, :, None])[:, :, 0]
-        return np.fft.irfft(shared.T, n=_ANGLES, axis=-1)
+        return np.asarray(np.fft.irfft(shared.T, n=_ANGLES, axis=-1), np.float32)
 
 
 def _silhouettes(target: Target, renderer: Renderer, n_views: int) -> Float32:
@@ -109,7 +109,9 @@ def _polar(image: UInt8, center: Float, radius: float) -> Float32:
     angle = np.arange(_ANGLES) * (2 * np.pi / _ANGLES)
     x = (center[0] + r[:, None] * np.cos(angle)).astype(np.float32)
     y = (center[1] + r[:, None] * np.sin(angle)).astype(np.float32)
-    return cv2.remap(image.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    values = image.astype(np.float32)
+    polar = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    return np.asarray(polar, np.float32)
 
 
 def _cut_direction(mask: Bool) -> Float | None:

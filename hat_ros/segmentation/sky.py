@@ -31,7 +31,7 @@ _HOLE_SHARE = 0.1  # a hole up to this share of the area is a dark detail; large
 # Gaps bridged, and room left around the lit parts, as shares of their longer side.
 _BRIDGED_SHARES = (0.02, 0.04, 0.08, 0.16)
 _BRIDGED_MARGIN = 0.1
-_FAINT_STEPS = 4  # below this many thresholds of contrast a single pixel says nothing
+_FAINT_STEPS = 4  # below this many thresholds of contrast a single pixel tells nothing
 _MAX_REGIONS = 8  # looked at; a field of stars may hold thousands
 _ROOM_PX = 2  # around a region: what its outline is trimmed with reaches so far
 _HOT_EXCESS = 30  # a hot pixel is this much brighter than all its neighbours
@@ -63,11 +63,11 @@ class Sky:
 
 def measure_sky(rgb: UInt8) -> Sky:
     """Level and noise of the sky from the image border: (H, W, 3) uint8."""
-    luma = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    luma = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
     around = cv2.dilate(luma, _NEIGHBOURS)
     hot = cv2.threshold(cv2.subtract(luma, around), _HOT_EXCESS, 1, cv2.THRESH_BINARY)[1]
     cv2.copyTo(around, hot, luma)
-    mean3 = cv2.boxFilter(luma, cv2.CV_32F, (3, 3))
+    mean3 = np.asarray(cv2.boxFilter(luma, cv2.CV_32F, (3, 3)), np.float32)
     ring = np.concatenate([mean3[strip].ravel() for strip in _border(luma.shape)])
     dark = ring[_dark_border(rgb)]
     if dark.size < 8:
@@ -91,7 +91,7 @@ def _median(values: Float32) -> float:
 
 
 def dark_border_share(rgb: UInt8) -> float:
-    """Share of the image border that is dark enough to be sky, at a glance: never less than ``Sky.border_share``."""
+    """Share of the image border that is dark enough to be sky, quickly: never less than ``Sky.border_share``."""
     dark = _dark_border(rgb)
     return np.count_nonzero(dark) / max(1, len(dark))
 
@@ -121,7 +121,7 @@ def lit_regions(sky: Sky) -> list[UInt8]:
     x0, y0 = max(0, x - gap - 2), max(0, y - gap - 2)
     x1, y1 = min(bright.shape[1], x + w + gap + 2), min(bright.shape[0], y + h + gap + 2)
     luma = np.ascontiguousarray(sky.luma[y0:y1, x0:x1])
-    peak = cv2.dilate(luma, _K5)
+    peak = np.asarray(cv2.dilate(luma, _K5), np.uint8)
     out = []
     for box, piece in _groups(np.ascontiguousarray(bright[y0:y1, x0:x1]), gap):
         region = np.zeros_like(bright)
@@ -163,7 +163,7 @@ def _groups(bright: Mask, gap: int) -> list[tuple[Box, Mask]]:
 def _trim_outline(region: Mask, luma: UInt8, peak: UInt8, sky: Sky) -> Mask:
     """Take off what blur and the 3 x 3 mean added around the outline; ``peak`` is the brightest pixel near each."""
     region = fill_holes(region, _HOLE_SHARE)
-    inner = cv2.erode(region, _K5, borderType=cv2.BORDER_REPLICATE)
+    inner = np.asarray(cv2.erode(region, _K5, borderType=cv2.BORDER_REPLICATE), np.uint8)
     at = region != inner
     high = peak[at] - sky.level
     # Where the step is within the noise of a single pixel the mean decides, which already chose the region.

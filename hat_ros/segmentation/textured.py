@@ -9,7 +9,7 @@ from hat_ros.array_types import UInt8
 from hat_ros.config import ClassicalConfig
 from hat_ros.geometry.masks import overlap
 from hat_ros.segmentation import region
-from hat_ros.segmentation.boundary import rehearse
+from hat_ros.segmentation.boundary import warm_up
 from hat_ros.segmentation.ground import GroundEvidence
 from hat_ros.segmentation.masks import SIDES, Mask, Window, moved, shift_between, touched_sides
 from hat_ros.segmentation.search import (
@@ -43,7 +43,7 @@ class TexturedBackground:
         self._config = config
         self._bank = bank
         self._search = Search(config, bank)
-        rehearse()
+        warm_up()
         self.reset()
 
     def reset(self) -> None:
@@ -53,8 +53,8 @@ class TexturedBackground:
         self._contrast = 0.0  # of the tracked outline, slowly following
         self._since_check = 0
         self._check_every = _CHECK_UNAIDED_FRAMES
-        self._unconfirmed = False  # the last glance found something else: a search is due
-        self._vouched = False  # by the ground behind it, for the tracked mask
+        self._unconfirmed = False  # the last quick check found something else: a search is due
+        self._on_ground = False  # the ground behind the tracked mask confirms it
         self._found_anew = False  # the previous mask: the one before it tells nothing about its motion
         self._failures = 0
         self._wait = 0
@@ -72,7 +72,7 @@ class TexturedBackground:
             rgb: (H, W, 3) uint8 image.
             masks: those of the frame before the previous one and of the previous one.
             silhouette: prediction, None without one.
-            trusted: whether somebody vouches for the prediction.
+            trusted: whether an image has supported the prediction.
         """
         self._search.push(rgb, masks[1])
         if masks[1] is not None:
@@ -80,7 +80,7 @@ class TexturedBackground:
             self._found_anew = False
             tracked, aided = self._track(rgb, masks[1], shift_xy, silhouette, trusted)
             self._since_check += 1
-            if tracked is not None and self._vouched:
+            if tracked is not None and self._on_ground:
                 return self._look_around(rgb, tracked) if self._since_check >= self._check_every else tracked
             if tracked is not None:
                 due = self._since_check >= (self._config.check_interval_frames if aided else self._check_every)
@@ -135,7 +135,7 @@ class TexturedBackground:
         predicted = None if silhouette is None else window.reduce(silhouette)
         seen = self._search.ground.evidence(window, max(w, h))
         best, aided = self._best_cut(window, previous, predicted, trusted, margin, seen)
-        self._vouched = best is not None and best.vouched
+        self._on_ground = best is not None and best.confirmed
         if best is None:
             return None, aided
         self._contrast += _CONTRAST_GAIN * (best.contrast - self._contrast)
@@ -153,7 +153,7 @@ class TexturedBackground:
         """Cut from the reduced previous mask, and from the reduced predicted silhouette besides.
 
         Without the prediction the cut has less freedom, with it it cannot drift. A trusted prediction is followed,
-        unless it leads away from the previous mask to nothing more plausible; one that nobody vouches for where it
+        unless it leads away from the previous mask to nothing more plausible; one without support where it
         makes the mask more plausible and its outline no less clear.
 
         Returns:
@@ -164,7 +164,7 @@ class TexturedBackground:
             return self._cut(window, alone, margin, self._models, seen), False
         both, tried = [predicted, previous], self._models.copy()
         best = self._cut(window, both if trusted else alone, margin, self._models, seen)
-        if best is not None and (best.vouched or (trusted and overlap(best.mask, previous) >= _STEADY)):
+        if best is not None and (best.confirmed or (trusted and overlap(best.mask, previous) >= _STEADY)):
             return best, trusted
         other = self._cut(window, alone if trusted else both, margin, tried, seen)
         if other is not None:
@@ -184,7 +184,7 @@ class TexturedBackground:
     ) -> region.ClearCut | None:
         """Cut from reduced seeds, the last of them the previous mask; None when it leads away or loses contrast.
 
-        What is seen of the ground helps, unless it leads away: a part of it that nobody knows yet looks like target.
+        What is seen of the ground helps, unless it leads away: a part of it that is not known yet looks like target.
         """
         if seen is not None:
             aware = models.copy()
@@ -199,16 +199,16 @@ class TexturedBackground:
     def _checked(
         self, window: Window, seeds: list[Mask], cut: Mask | None, seen: GroundEvidence | None
     ) -> region.ClearCut | None:
-        """A cut from seeds with its contrast; None when it leads away or loses contrast, and nobody vouches for it."""
+        """A cut from seeds with its contrast; None if it leads away or loses contrast and no ground confirms it."""
         if cut is None:
             return None
         contrast = region.edge_contrast(region.color_step(window.rgb), cut)
         if seen is not None:
-            if seen.vouches_for(cut):
-                return region.ClearCut(cut, contrast, vouched=True)
+            if seen.confirms(cut):
+                return region.ClearCut(cut, contrast, confirmed=True)
             if seen.contradicts(cut):
                 return None
-        grown = np.count_nonzero(cut) / max(1, np.count_nonzero(seeds[-1]))
+        grown = np.count_nonzero(cut) / max(1, int(np.count_nonzero(seeds[-1])))
         if not 1 / _MAX_AREA_CHANGE <= grown <= _MAX_AREA_CHANGE or overlap(cut, seeds[0]) < _MIN_CONTINUITY:
             return None
         if contrast < max(MIN_CONTRAST, _MIN_CONTRAST_KEPT * self._contrast):
@@ -220,7 +220,7 @@ class TexturedBackground:
         return other.contrast >= than.contrast and gain >= OPEN_BETTER
 
     def _look_around(self, rgb: UInt8, tracked: Mask) -> Mask:
-        """A mask that the ground vouches for, unless more of the target stands before the ground beyond it."""
+        """A mask that the ground confirms, unless more of the target stands before the ground beyond it."""
         self._since_check = 0
         found = self._search.before_ground(rgb)
         if found is not None and overlap(found.mask, tracked) < _NEARLY_SAME:
@@ -232,9 +232,9 @@ class TexturedBackground:
     def _cross_check(self, rgb: UInt8, tracked: Mask, aided: bool, silhouette: Mask | None) -> Mask | None:
         """Compare a tracked mask with what a search from nothing finds; keep the more plausible one.
 
-        A mask held in place by a prediction is given up only for one that means something else; while a glance finds
-        the same, nothing more is searched. A glance and a search take as long as several frames, so the search waits
-        for the next one. What a prediction speaks for, trusted or not, must be clearly beaten.
+        A mask held in place by a prediction is given up only for one that means something else; while a quick check
+        finds the same, nothing more is searched. A check and a search take as long as several frames, so the search
+        waits for the next one. What agrees with a prediction, trusted or not, must be clearly beaten.
         """
         self._since_check = 0
         if aided and not self._unconfirmed:

@@ -110,7 +110,7 @@ def test_unhealthy_priors_are_not_used(clip, motions):
 def test_where_the_tracks_leave_the_relief_open_the_fused_turn_decides(clip, monkeypatch):
     slam = FeatureSlam(config(), clip.target)
     run(slam, clip, last=16)
-    window = slam._window
+    window = slam._epoch._window
     monkeypatch.setattr(window, "_descend", lambda state, problem, n: (window.cost, window.covariance))
     since_ns, before = window.stamps_ns[-5], window.R.copy()
     own = turn_between(window.R[-1], window.R[-5])

@@ -212,22 +212,22 @@ def test_a_mask_locked_onto_the_ground_is_given_up(stage, scene):
     assert (run(stage, scene, lambda T, i: None, frames=20)[-10:] > 0.9).all()
 
 
-def test_a_glance_that_finds_something_else_leaves_the_search_to_the_next_frame(stage, scene, monkeypatch):
-    glances, searches = [], []
+def test_a_quick_check_that_finds_something_else_leaves_the_search_to_the_next_frame(stage, scene, monkeypatch):
+    checks, searches = [], []
     find = Search.find
-    monkeypatch.setattr(GroundMemory, "evidence", lambda *_: None)  # a mask that the ground vouches for is let alone
-    monkeypatch.setattr(Search, "confirms", lambda *_: glances.append(i) or False)
+    monkeypatch.setattr(GroundMemory, "evidence", lambda *_: None)  # a mask that the ground confirms is let alone
+    monkeypatch.setattr(Search, "confirms", lambda *_: checks.append(i) or False)
     monkeypatch.setattr(Search, "find", lambda *args: searches.append(i) or find(*args))
     for i in range(50):
         T, rgb, truth = scene.passing(i % 12 if i % 24 < 12 else 11 - i % 12)
         found = stage.update(frame(i, rgb), prior(T) if i > 2 else None)
     assert overlap(found.mask, truth) > 0.9
-    assert glances
-    assert {i + 1 for i in glances} <= set(searches)
-    assert not set(glances) & set(searches)
+    assert checks
+    assert {i + 1 for i in checks} <= set(searches)
+    assert not set(checks) & set(searches)
 
 
-def test_ground_that_nobody_knew_does_not_lose_a_tracked_mask(stage, scene, monkeypatch):
+def test_unknown_ground_does_not_lose_a_tracked_mask(stage, scene, monkeypatch):
     """Everything new looks as if it stood before the ground; the mask goes on without that, and without a search."""
     before = run(stage, scene, lambda T, i: None, frames=4)
 

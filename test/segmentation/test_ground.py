@@ -61,17 +61,17 @@ def test_what_stands_before_the_ground_is_found(scene, view, told):
     assert not (seen.ground & cv2.erode(body, np.ones((5, 5), np.uint8))).mean() > 0.01
 
 
-def test_it_vouches_for_the_right_mask_and_contradicts_another(scene):
+def test_it_confirms_the_right_mask_and_contradicts_another(scene):
     memory, window = remembered(scene, shifted, 18, truth())
     seen = memory.evidence(window, LENGTH_PX)
     body = window.reduce(truth())
     half = body.copy()
     half[:, : window.rgb.shape[1] // 2] = 0
     elsewhere = np.roll(body, -40, axis=0)
-    assert seen.vouches_for(body)
+    assert seen.confirms(body)
     assert not seen.contradicts(body)
-    assert not seen.vouches_for(half)
-    assert not seen.vouches_for(elsewhere)
+    assert not seen.confirms(half)
+    assert not seen.confirms(elsewhere)
     assert seen.contradicts(elsewhere)
 
 

@@ -14,7 +14,7 @@ def search(lopsided):
     return Search(HatConfig().segmentation.classical, SilhouetteBank(lopsided, RayRenderer(lopsided)))
 
 
-def glances(search, scene, mask_of, frames=range(3, 9)):
+def checks(search, scene, mask_of, frames=range(3, 9)):
     """Whether single cuts confirm the mask that ``mask_of`` makes of the truth, frame by frame."""
     out = []
     for i in range(frames.stop):
@@ -25,18 +25,18 @@ def glances(search, scene, mask_of, frames=range(3, 9)):
     return np.array(out)
 
 
-def test_a_glance_confirms_the_right_mask(search, scene):
-    assert glances(search, scene, lambda truth: truth).all()
+def test_a_quick_check_confirms_the_right_mask(search, scene):
+    assert checks(search, scene, lambda truth: truth).all()
 
 
-def test_a_glance_confirms_no_other_mask(search, scene):
+def test_a_quick_check_confirms_no_other_mask(search, scene):
     elsewhere = cv2.circle(np.zeros((HEIGHT, WIDTH), np.uint8), (60, 60), 40, 1, -1)
-    assert not glances(search, scene, lambda _: elsewhere).any()
-    assert not glances(search, scene, lambda truth: np.roll(truth, 30, axis=1)).any()
-    assert not glances(search, scene, lambda truth: np.zeros_like(truth)).any()
+    assert not checks(search, scene, lambda _: elsewhere).any()
+    assert not checks(search, scene, lambda truth: np.roll(truth, 30, axis=1)).any()
+    assert not checks(search, scene, lambda truth: np.zeros_like(truth)).any()
 
 
-def test_a_glance_confirms_a_mask_that_the_border_cuts(search, scene):
+def test_a_quick_check_confirms_a_mask_that_the_border_cuts(search, scene):
     T = scene.pose(0.3, x=-1.9)
     truth = scene.truth(T).astype(np.uint8)
     assert truth[:, 0].any()
