@@ -76,11 +76,23 @@ PY
 
 use() { (cd "$work/away" && "$work/venv/bin/$1" "${@:2}"); }
 
-check_version() {
+check_package() {
   local said
   said=$(use hat --version)
   [ "$said" = "hat $(use python -c 'from importlib.metadata import version; print(version("hat_ros"))')" ] ||
     { echo "hat --version said: $said"; return 1; }
+  use python - "$root" <<'PY'
+import sys
+from importlib.resources import files
+from hat_ros import load_config
+from hat_ros.config import preset_names
+package = files("hat_ros")
+assert not str(package).startswith(sys.argv[1]), f"{package} is the checkout"
+assert (package / "py.typed").is_file()
+assert set(preset_names()) >= {"default", "mega_hat", "pico_hat"}, preset_names()
+for name in preset_names():
+    load_config(name)
+PY
 }
 
 check_poses() {
@@ -102,7 +114,7 @@ check() {
   step "sdist" build_sdist
   step "wheel from the sdist" build_wheel
   step "install into an empty environment" install_wheel
-  step "hat --version" check_version
+  step "version, presets, py.typed" check_package
   step "hat synth" use hat synth probe --out clip --frames 30 --size 320 240 --focal 500 --quiet
   step "hat track" use hat track clip --out track --quiet
   step "hat replay" use hat replay clip --out replay --quiet
