@@ -1,19 +1,15 @@
 """Result folders: atomic, readable when stopped, the same from memory and from the bag."""
 
-import csv
-
 import numpy as np
 import pytest
 import yaml
-from scripted import CAMERA, stamp, steps, true_row, truth
+from scripted import CAMERA, steps, true_row, truth
 
-from hat_ros.bench.evaluation.result_folder import write_tables
 from hat_ros.config import HatConfig, config_from_dict
 from hat_ros.errors import BagError, UsageError
 from hat_ros.io.result_bag import ResultBagWriter, read_result_bag
 from hat_ros.io.results import LiveTables, ResultFolder, tum_line, write_config
 from hat_ros.io.run_log import RunLogBuilder
-from hat_ros.types import TrackState
 
 
 @pytest.fixture
@@ -134,22 +130,6 @@ def test_old_result_stays_until_the_new_one_is_complete(tmp_path):
 def test_config_as_used_is_complete_and_reads_back(tmp_path):
     write_config(tmp_path, HatConfig())
     assert config_from_dict(yaml.safe_load((tmp_path / "config.yaml").read_text())) == HatConfig()
-
-
-def test_tables(tmp_path):
-    log = in_memory()
-    write_tables(tmp_path, log)
-    rows = list(csv.DictReader((tmp_path / "poses.csv").open()))
-    assert [int(row["stamp_ns"]) for row in rows] == [stamp(i) for i in range(10)]
-    assert rows[0]["state"] == "UNINITIALISED"
-    assert rows[0]["x_m"] == rows[0]["E_p"] == "", "no output has no error, not an error of zero"
-    assert float(rows[3]["E_q_deg"]) == pytest.approx(3.0)
-    assert float(rows[3]["E_t_m"]) == pytest.approx(0.05)
-    assert rows[8]["state"] == TrackState.LOST.name
-    assert rows[8]["qw"] == ""
-    tum = (tmp_path / "poses.tum").read_text().splitlines()
-    assert len(tum) == 7
-    assert tum[0].startswith("1.100000000 ")
 
 
 def test_tum_line_keeps_nanoseconds_and_every_bit():

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from hat_ros.array_types import Float
+from hat_ros.bench.datasets.image_files import ImageRecording
 from hat_ros.bench.datasets.pose_files import read_poses
 from hat_ros.bench.evaluation.result_folder import complete_folder
 from hat_ros.bench.runs.folder import RunOptions, result_folder
@@ -55,7 +56,8 @@ def score_poses(spec: SourceSpec, poses: Path, out: Path, options: ScoreOptions)
     folder = ResultFolder(out, options.overwrite)
     source = spec.open()
     stamps = frame_stamps(source, options.start, options.limit)
-    found = read_poses(poses, getattr(source.recording, "scene", None))
+    scene = source.recording.scene if isinstance(source.recording, ImageRecording) else None
+    found = read_poses(poses, scene)
     rows = match_stamps(stamps, found.rows)
     if not rows:
         raise InputError(f"poses {poses}: none lies within 1 ms of a frame of {spec.path}; stamps begin at {stamps[0]}")
