@@ -7,7 +7,6 @@ flipped bit.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,6 +23,8 @@ from hat_ros.io.images import encode_image
 from hat_ros.io.manifest import TARGET_FILE, write_manifest
 from hat_ros.io.mcap_folder import McapFolder
 from hat_ros.io.rosbag import TYPESTORE
+from hat_ros.target.companions import copy_with_companions
+from hat_ros.target.mesh_file import companions_of
 from hat_ros.types import Camera
 
 IMAGE_FORMATS = ("raw", "png", "jpeg")
@@ -119,7 +120,7 @@ class BagWriter:
         self.write_message(topics.IMAGE_COMPRESSED, make.compressed(stamp_ns, frame_id, kind, data), stamp_ns)
 
     def write_target(self, mesh: str | Path, unit_scale: float = 1.0, name: str | None = None) -> None:
-        """Put a copy of the CAD model and its ``target.yaml`` into the bag's folder.
+        """Put a copy of the CAD model, of what it names beside it, and a ``target.yaml`` into the bag's folder.
 
         Args:
             mesh: the model's file.
@@ -129,7 +130,7 @@ class BagWriter:
         mesh = Path(mesh)
         content = {"mesh": mesh.name, "unit_scale": float(unit_scale), "name": name or mesh.stem}
         with _as_run_error(self.path):
-            shutil.copyfile(mesh, self.path / mesh.name)
+            copy_with_companions(mesh, companions_of(mesh), self.path, mesh.name)
             (self.path / TARGET_FILE).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
 
     def close(self) -> None:

@@ -22,9 +22,9 @@ def sha256_of(path: Path) -> str:
 
 
 def write_manifest(folder: Path) -> None:
-    """Write the SHA-256 of every file in the folder beside them."""
-    files = sorted(file for file in folder.iterdir() if file.is_file() and file.name != MANIFEST)
-    digests = {file.name: sha256_of(file) for file in files}
+    """Write the SHA-256 of every file in the folder, textures in folders of their own included, beside them."""
+    files = sorted(file for file in folder.rglob("*") if file.is_file() and file != folder / MANIFEST)
+    digests = {file.relative_to(folder).as_posix(): sha256_of(file) for file in files}
     (folder / MANIFEST).write_text(json.dumps({"sha256": digests}, indent=2) + "\n", encoding="utf-8")
 
 
@@ -43,7 +43,9 @@ def check_manifest(folder: Path) -> None:
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise BagError(f"{path} is not a manifest: delete it to read the bag unchecked") from None
     for name, digest in items:
-        file = folder / Path(name).name
+        file = folder / name
+        if folder.resolve() not in file.resolve().parents:
+            raise BagError(f"{path} lists {name}, which does not lie in the bag: delete it to read the bag unchecked")
         if not file.is_file():
             raise BagError(f"{folder} lacks {name}, which its manifest lists: copy the bag again")
         if sha256_of(file) != digest:

@@ -7,6 +7,7 @@ y-up if it was modelled so.
 from __future__ import annotations
 
 import hashlib
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ import trimesh
 
 from hat_ros.array_types import Bool, Float, Float32, Int, UInt8
 from hat_ros.errors import MeshError
+from hat_ros.target.companions import say_once
 from hat_ros.target.mesh_file import read_scene, read_target_yaml
 from hat_ros.target.model import Surface, Target, area_vectors, triangle_areas
 from hat_ros.target.srgb import linear_from_srgb, srgb_from_linear
@@ -65,6 +67,8 @@ def target_from_scene(scene: trimesh.Scene, name: str, unit_scale: float = 1.0) 
     parts = [part for part in found if part is not None]
     if not parts:
         raise MeshError(f"CAD model {name}: it holds no triangles; export the surface as a triangle mesh")
+    if not any(part.has_color for part in parts):
+        say_once(f"CAD model {name}: it has no colours and is taken as grey", logging.INFO)
     corners = np.concatenate([part.corners_m for part in parts]) * unit_scale
     _check_extent(corners, name, unit_scale)
     # Exporters split vertices at texture seams, with rounding noise: merge what a millionth of the extent separates.
@@ -95,6 +99,7 @@ class _Part:
     texture: UInt8 | None
     roughness: float
     metallic: float
+    has_color: bool
 
 
 def _part(scene: trimesh.Scene, node: str, name: str) -> _Part | None:
@@ -110,8 +115,8 @@ def _part(scene: trimesh.Scene, node: str, name: str) -> _Part | None:
     corner_uv = np.zeros((n_faces, 3, 2), np.float32)
     corner_rgb, texture, rgb = None, None, np.full((n_faces, 3), _GREY, np.uint8)
     roughness, metallic = 0.6, 0.0
-    visual = mesh.visual
-    if isinstance(visual, trimesh.visual.TextureVisuals):
+    visual, has_color = mesh.visual, True
+    if isinstance(visual, trimesh.visual.TextureVisuals) and not _is_placeholder(visual.material):
         rgb[:], texture, roughness, metallic = _material(visual.material)
         uv = None if visual.uv is None else np.asarray(visual.uv, dtype=np.float32)
         if uv is None or len(uv) != len(mesh.vertices) or not np.isfinite(uv).all():
@@ -122,8 +127,10 @@ def _part(scene: trimesh.Scene, node: str, name: str) -> _Part | None:
         corner_rgb = np.asarray(visual.vertex_colors, dtype=np.uint8)[:, :3][faces]
     elif isinstance(visual, trimesh.visual.ColorVisuals) and visual.kind == "face":
         rgb = np.asarray(visual.face_colors, dtype=np.uint8)[:, :3].copy()
+    else:
+        has_color = False
     normal = _corner_normals(mesh, vertices[faces], faces, T[:3, :3])
-    return _Part(vertices[faces], corner_uv, corner_rgb, normal, rgb, texture, roughness, metallic)
+    return _Part(vertices[faces], corner_uv, corner_rgb, normal, rgb, texture, roughness, metallic, has_color)
 
 
 def _corner_normals(mesh: trimesh.Trimesh, corners: Float, faces: Int, linear: Float) -> Float32:
@@ -137,6 +144,14 @@ def _corner_normals(mesh: trimesh.Trimesh, corners: Float, faces: Int, linear: F
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     normal = np.where(length > 1e-12, normal, flat)
     return (normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-300)).astype(np.float32)
+
+
+def _is_placeholder(material: Any) -> bool:
+    """Whether ``trimesh`` made it up, with an image of one colour, for texture coordinates without a material."""
+    if not isinstance(material, trimesh.visual.material.SimpleMaterial) or material.image is None:
+        return False
+    made_up = trimesh.visual.material.empty_material().image
+    return material.image.size == made_up.size and material.image.tobytes() == made_up.tobytes()
 
 
 def _material(material: Any) -> tuple[UInt8, UInt8 | None, float, float]:

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import io
 import json
+import logging
+import re
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import trimesh
 import yaml
 
 from hat_ros.errors import MeshError
+from hat_ros.target.companions import MATERIAL_SUFFIX, Companions, say_once
+from hat_ros.target.obj_text import material_libraries, plain_obj
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb")
 MAX_FILE_BYTES = 256 * 2**20
@@ -47,9 +54,23 @@ def read_target_yaml(path: Path) -> tuple[Path, float, str]:
 def read_scene(path: Path) -> trimesh.Scene:
     """A mesh file as ``trimesh`` reads it, after the checks of this module.
 
+    What it names and is not used (missing material files and textures, bytes after the end) is a warning.
+
     Raises:
         MeshError: missing, another format, too large, or not readable as what it claims to be.
     """
+    scene, files = _read(path)
+    for sentence in (*files.problems, *_unknown_materials(path, files)):
+        say_once(sentence)
+    return scene
+
+
+def companions_of(path: Path) -> dict[str, Path]:
+    """What a mesh names and has beside it: path relative to the mesh's folder -> file; errors of :func:`read_scene`."""
+    return _read(path)[1].found
+
+
+def _read(path: Path) -> tuple[trimesh.Scene, Companions]:
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise MeshError(f"CAD model {path.name}: format '{suffix}' is not supported, give {', '.join(MESH_SUFFIXES)}")
@@ -58,15 +79,48 @@ def read_scene(path: Path) -> trimesh.Scene:
     size = path.stat().st_size
     if not 0 < size <= MAX_FILE_BYTES:
         raise MeshError(f"CAD model {path.name}: the file has {size} bytes, expected 1 to {MAX_FILE_BYTES}")
-    {".glb": _check_glb, ".ply": _check_ply, ".stl": _check_text_or_size, ".obj": _check_text_or_size}[suffix](path)
+    {".glb": _check_glb, ".ply": _check_ply, ".stl": _check_archive, ".obj": _check_archive}[suffix](path)
+    source: Path | io.BytesIO = path
+    libraries: list[str] = []
+    if suffix == ".obj":
+        text = plain_obj(path.read_bytes(), path.name)
+        source, libraries = io.BytesIO(text), material_libraries(text)
+    elif suffix == ".stl":
+        source = io.BytesIO(_stl_of_declared_size(path))
+    files = Companions(path, libraries)
     try:
-        scene = trimesh.load_scene(path, file_type=suffix[1:], process=False)
+        with _silent_trimesh():
+            scene = trimesh.load_scene(source, file_type=suffix[1:], resolver=files, process=False)
     except Exception as error:  # parsers raise whatever the broken bytes lead them to
         raise MeshError(
             f"CAD model {path.name}: not a readable {suffix[1:]} file ({type(error).__name__}: {_short(error)})"
         ) from None
     _check_scene(scene, path.name)
-    return scene
+    return scene, files
+
+
+@contextmanager
+def _silent_trimesh() -> Iterator[None]:
+    """Without the tracebacks that ``trimesh`` logs for files that it does not find: they are reported in a sentence."""
+    log = logging.getLogger("trimesh")
+    before, log.disabled = log.disabled, True
+    try:
+        yield
+    finally:
+        log.disabled = before
+
+
+def _unknown_materials(path: Path, files: Companions) -> Iterator[str]:
+    """A sentence on the materials that the faces of an OBJ name and that its material file does not define."""
+    libraries = [file for file in files.found.values() if file.suffix.lower() == MATERIAL_SUFFIX]
+    if path.suffix.lower() != ".obj" or not (libraries or not files.problems):
+        return
+    used = set(re.findall(rb"^\s*usemtl[ \t]+(\S[^\r\n]*?)\s*$", path.read_bytes(), re.MULTILINE))
+    text = b"\n".join(file.read_bytes() for file in libraries)
+    missing = used - set(re.findall(rb"^\s*newmtl[ \t]+(\S[^\r\n]*?)\s*$", text, re.MULTILINE))
+    if missing:
+        names = ", ".join(sorted(name.decode("utf-8", "replace") for name in missing)[:5])
+        yield f"CAD model {path.name}: no material file that it names defines '{names}': these faces are grey"
 
 
 def _short(error: Exception) -> str:
@@ -85,16 +139,31 @@ def _check_scene(scene: trimesh.Scene, name: str) -> None:
         raise MeshError(f"CAD model {name}: {n_faces} triangles, at most {MAX_FACES} are accepted; simplify it")
 
 
-def _check_text_or_size(path: Path) -> None:
-    """OBJ and STL declare little: refuse archives in disguise and a binary STL longer than its file."""
+def _check_archive(path: Path) -> None:
+    """OBJ and STL declare little: refuse archives in disguise."""
     with path.open("rb") as file:
-        head = file.read(84)
-    if head[:4] in (b"PK\x03\x04", b"\x1f\x8b\x08\x00", b"7z\xbc\xaf") or head[:2] == b"\x1f\x8b":
+        head = file.read(4)
+    if head in (b"PK\x03\x04", b"\x1f\x8b\x08\x00", b"7z\xbc\xaf") or head[:2] == b"\x1f\x8b":
         raise MeshError(f"CAD model {path.name}: it is an archive, not a {path.suffix[1:]} file; unpack it first")
-    if path.suffix.lower() == ".stl" and not head.lstrip().lower().startswith(b"solid") and len(head) == 84:
-        declared = struct.unpack("<I", head[80:])[0]
-        if 84 + 50 * declared != path.stat().st_size:
-            raise MeshError(f"CAD model {path.name}: the STL header says {declared} triangles, the file's size differs")
+
+
+def _stl_of_declared_size(path: Path) -> bytes:
+    """A binary STL up to its last triangle; exporters append bytes. ASCII comes back as it is."""
+    data = path.read_bytes()
+    is_text = data.lstrip()[:5].lower() == b"solid"
+    if len(data) < 84:
+        return data
+    declared = 84 + 50 * struct.unpack("<I", data[80:84])[0]
+    if is_text and declared > len(data):  # text read as a count is far too large
+        return data
+    if declared > len(data):
+        raise MeshError(
+            f"CAD model {path.name}: its STL header declares {(declared - 84) // 50} triangles, {declared} bytes, the "
+            f"file has {len(data)}: export it again"
+        )
+    if declared < len(data) and declared > 84:
+        say_once(f"CAD model {path.name}: {len(data) - declared} bytes after its last triangle are ignored")
+    return data[:declared]
 
 
 def _check_ply(path: Path) -> None:

@@ -155,3 +155,43 @@ def test_glb_with_malformed_header_is_refused(tmp_path, document):
     write_glb(path, document)
     with pytest.raises(MeshError):
         load_target(path)
+
+
+def stl_of(mesh, header=b"made by hand", tail=b""):
+    data = mesh.export(file_type="stl")
+    return header.ljust(80, b" ")[:80] + data[80:] + tail
+
+
+@pytest.mark.parametrize("header", [b"made by hand", b"solid box"])
+@pytest.mark.parametrize("tail", [b"\0\0", b"\r\n", b"x" * 49, bytes(200)])
+def test_bytes_after_the_last_triangle_are_ignored_with_one_warning(tmp_path, caplog, header, tail):
+    path = tmp_path / f"{header[:5].decode()}{len(tail)}{tail[0]}.stl"
+    path.write_bytes(stl_of(box(), header, tail))
+    assert load_target(path).faces.shape == load_target(path).faces.shape == (12, 3)
+    assert [record.getMessage() for record in caplog.records if record.levelname == "WARNING"] == [
+        f"CAD model {path.name}: {len(tail)} bytes after its last triangle are ignored"
+    ]
+
+
+@pytest.mark.parametrize("tail", ["", "\n\n", "\x1a", "\0\0"])
+def test_ascii_stl_with_bytes_after_its_end(tmp_path, tail):
+    path = tmp_path / "text.stl"
+    path.write_text(box().export(file_type="stl_ascii") + tail)
+    assert load_target(path).faces.shape == (12, 3)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("suffix", ["obj", "ply", "stl", "glb"])
+def test_degenerate_triangles_are_removed_without_a_word(tmp_path, caplog, suffix):
+    good = box()
+    points = np.vstack([good.vertices, [[5, 0, 0], [6, 0, 0], [7, 0, 0]]])
+    empty = [[8, 9, 10], [0, 0, 1], [2, 2, 2], [8, 8, 8]]
+    mesh = trimesh.Trimesh(points, np.vstack([good.faces, empty]), process=False)
+    path = tmp_path / f"thin.{suffix}"
+    mesh.export(path)
+    if suffix == "obj":
+        path.write_text(path.read_text() + "vn nan nan nan\nf 1//1 2//1 2//1\nf 1//1 2//1 4//1\n")
+    target = load_target(path)
+    assert len(target.vertices_m) == 8 and np.isfinite(target.surface.corner_normal).all()
+    np.testing.assert_allclose(target.center_m, 0, atol=1e-7)
+    assert not [record for record in caplog.records if record.levelname == "WARNING"]

@@ -21,6 +21,7 @@ from hat_ros.errors import DatasetError, UsageError
 from hat_ros.io.bag_writer import BagWriter
 from hat_ros.io.provenance import input_hash
 from hat_ros.target.loading import load_target
+from hat_ros.target.mesh_file import companions_of
 from hat_ros.target.rendering import create_renderer
 
 LOG = logging.getLogger(__name__)
@@ -135,10 +136,12 @@ def import_dataset(
 
 def _made_from(fmt: str, recording: ImageRecording, boxes: bool, detections: Path | None) -> dict[str, Any]:
     """What decides a bag's content beside the data set's own images and labels."""
+    companions = companions_of(recording.target_path)
     return {
         "format": fmt,
         "sequence": recording.name,
         "model_sha256": input_hash(recording.target_path),
+        **({"companions_sha256": {name: input_hash(path) for name, path in companions.items()}} if companions else {}),
         "boxes_from_labels": boxes,
         "detections": None if detections is None else detections.name,
         "detections_sha256": None if detections is None else input_hash(detections),

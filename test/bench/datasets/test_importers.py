@@ -20,7 +20,7 @@ from hat_ros.bench.datasets.importer import (
     with_annotation_boxes,
 )
 from hat_ros.bench.datasets.sequence import load_sequence, write_labels
-from hat_ros.errors import DatasetError, MeshError, UsageError
+from hat_ros.errors import BagError, DatasetError, MeshError, UsageError
 from hat_ros.geometry import lie
 from hat_ros.io.bag_reader import BagReader
 from hat_ros.target.loading import load_target
@@ -635,3 +635,31 @@ def test_detections_and_boxes_from_the_labels_exclude_each_other(sequence, tmp_p
         import_dataset("sequence", sequence, tmp_path / "bag", detections=tmp_path / "x.json", boxes=True)
     with pytest.raises(DatasetError, match="no such file or folder of detections"):
         import_dataset("sequence", sequence, tmp_path / "bag", detections=tmp_path / "x.json")
+
+
+# ---------------------------------------------------------------- what the model names
+
+
+def test_an_imported_bag_has_the_textures_of_its_model_in_the_manifest(bop_root, tmp_path):
+    models = bop_root / "models"
+    (models / "maps").mkdir()
+    cv2.imwrite(str(models / "maps" / "tex.png"), np.full((4, 4, 3), (20, 40, 200), np.uint8))
+    (models / "obj_000002.ply").write_text(
+        "ply\nformat ascii 1.0\ncomment TextureFile maps/tex.png\nelement vertex 4\nproperty float x\n"
+        "property float y\nproperty float z\nproperty float s\nproperty float t\nelement face 4\n"
+        "property list uchar int vertex_indices\nend_header\n0 0 0 0.5 0.5\n90 0 0 0.5 0.5\n0 80 0 0.5 0.5\n"
+        "0 0 70 0.5 0.5\n3 0 2 1\n3 0 1 3\n3 0 3 2\n3 1 2 3\n"
+    )
+    bag = import_dataset("bop", bop_root, tmp_path / "bags", sequences=["000048_obj2"])[0]
+    listed = json.loads((bag / "manifest.json").read_text())["sha256"]
+    assert "maps/tex.png" in listed
+    (recording,) = open_dataset("bop", bop_root, sequences=["000048_obj2"])
+    here, there = load_target(recording.target_path, recording.unit_scale), load_target(bag / "target.yaml")
+    assert here.sha256 == there.sha256 and (there.face_rgb == (200, 40, 20)).all()
+    np.testing.assert_array_equal(here.surface.textures[0], there.surface.textures[0])
+    (bag / "maps" / "tex.png").unlink()
+    with pytest.raises(BagError, match=r"lacks maps/tex\.png"):
+        BagReader(bag)
+    cv2.imwrite(str(models / "maps" / "tex.png"), np.full((4, 4, 3), (200, 40, 20), np.uint8))
+    import_dataset("bop", bop_root, tmp_path / "bags", sequences=["000048_obj2"])
+    assert (load_target(bag / "target.yaml").face_rgb == (20, 40, 200)).all()
