@@ -97,14 +97,14 @@ BACKENDS: dict[str, dict[str, str]] = {
 }
 
 # slam backend -> its motion smoothed over the whole clip, for the non-causal reference; others have causal motion only.
-OFFLINE_MOTIONS: dict[str, str] = {"droid": "hat_ros.motion.droid:offline_motions"}
+WHOLE_CLIP_MOTIONS: dict[str, str] = {"droid": "hat_ros.motion.droid:whole_clip_motions"}
 
-OfflineMotions = Callable[[HatConfig, Sequence[tuple[Frame, Detection | None]]], list[Motion]]
+WholeClipMotions = Callable[[HatConfig, Sequence[tuple[Frame, Detection | None]]], list[Motion]]
 
 
-def offline_motions_of(config: HatConfig) -> OfflineMotions | None:
+def whole_clip_motions_of(config: HatConfig) -> WholeClipMotions | None:
     """The motion backend's smoothing over a whole clip; None if it has only its causal motion."""
-    where = OFFLINE_MOTIONS.get(config.slam.backend)
+    where = WHOLE_CLIP_MOTIONS.get(config.slam.backend)
     if where is None:
         return None
     module_name, function_name = where.split(":")

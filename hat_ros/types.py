@@ -333,7 +333,7 @@ class Refined:
     def quality(self) -> float:
         """Image evidence for the pose, 0 to 1: mean of contour support and visible silhouette overlap.
 
-        What is black on black speaks neither for nor against it. Without a silhouette mask the contour speaks alone.
+        What is black on black is no evidence. Without a silhouette mask the contour counts alone.
         """
         return self.support if np.isnan(self.visible_overlap) else 0.5 * (self.support + self.visible_overlap)
 

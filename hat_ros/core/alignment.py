@@ -7,7 +7,8 @@ The fit separates. With ``u = (R^A)^T t^A`` the two halves of the residual of on
 
 so the minimum of eq. (alignmentfit) is the mean of the rotations ``(R^S R_M)^T`` beside the straight-line regression
 of c on t^S. It is the minimum that a Levenberg-Marquardt search over log-scale, rotation vector and translation
-approaches (a test compares them), at a cost that allows thousands of observations.
+approaches (a test compares them), at a cost that allows thousands of observations. No nonlinear solver is
+needed.
 """
 
 from __future__ import annotations

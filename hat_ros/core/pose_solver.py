@@ -1,4 +1,10 @@
-"""The 6-DoF robust solve of Stage 4b, eqs. (fusionresiduals) and (causalfusion): one free pose, two measurements."""
+"""The 6-DoF robust solve of Stage 4b, eqs. (fusionresiduals) and (causalfusion): one free pose, two measurements.
+
+Own code, because ``scipy.optimize.least_squares`` accepts steps by their cost, whose rounding hides all steps below the
+root of the machine precision: with its tolerances at 1e-15 it stops up to 1e-8 rad and 1e-8 m off, at a gradient of up
+to 5e-8, in twice the time (2 to 5 ms instead of 0.5 to 2.5 ms; nine problems of the tests, Huber and squared loss). The
+search here ends at a gradient below 1e-11.
+"""
 
 from __future__ import annotations
 
@@ -133,7 +139,7 @@ def _descent_step(hessian: Float, gradient: Float) -> Float:
     values, vectors = np.linalg.eigh(hessian)
     values = np.maximum(np.abs(values), 1e-12 * np.abs(values).max())
     step = -vectors @ ((vectors.T @ gradient) / values)
-    # Beyond half a radian the local model of a rotation says little.
+    # Beyond half a radian the local model of a rotation is poor.
     turn = float(np.linalg.norm(step[:3]))
     return step * min(1.0, 0.5 / turn) if turn > 0 else step
 

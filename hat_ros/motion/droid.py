@@ -98,7 +98,7 @@ class DroidSlam:
 
 
 @torch.inference_mode()
-def offline_motions(
+def whole_clip_motions(
     config: HatConfig, clip: Sequence[tuple[Frame, Detection | None]], model: FlowModel | None = None
 ) -> list[Motion]:
     """Motion of a whole clip by global optimisation: the non-causal reference of :class:`DroidSlam`.

@@ -1,4 +1,4 @@
-"""The offline reference: two global bundle adjustments over all keyframes, then a pose for every frame.
+"""Smoothing over the whole clip: two global bundle adjustments over all keyframes, then a pose for every frame.
 
 Not causal and not used by the tracker: it says how much the causal read-out gives away. (arXiv:2108.10869, section
 3.4, back end; poses of the other frames as in the released tracker.)
@@ -41,7 +41,7 @@ def finish(frontend: DroidFrontend, images: Iterable[tuple[int, Tensor]]) -> Ten
     """
     if not frontend.initialised:
         raise RunError(
-            f"offline DROID: the clip has {len(frontend.keyframes)} keyframes, the warm-up needs "
+            f"DROID over a whole clip: it has {len(frontend.keyframes)} keyframes, the warm-up needs "
             f"{frontend.config.warmup_keyframes}; lower slam.droid.filter_threshold or give a longer clip"
         )
     for steps in GLOBAL_STEPS:

@@ -52,7 +52,7 @@ class FeatureSlam:
     def __init__(self, config: HatConfig, target: Target | None) -> None:
         self._config, self._masked = config.slam.feature, config.slam.masked
         self._new_surface: Callable[[], SurfacePrior] | None = None
-        # In a whole scene the target is a small part: its surface would say little, and pull at everything.
+        # In a whole scene the target is a small part: its surface would tell little, and pull at everything.
         if target is not None and self._config.use_prior and self._masked:
             caster, radius_m = ray_caster(target), target.bounding_radius_m
             self._new_surface = partial(SurfacePrior, self._config, caster, radius_m, config.prior.delay_frames)

@@ -4,6 +4,7 @@ Every edge (i, j) of the graph says where the pixels of frame i should appear in
 (Schur complement: each pixel's depth is independent of all others), the small system of poses is solved in float64,
 then the depths follow (arXiv:2108.10869, section 3.2, "Dense Bundle Adjustment Layer"). Nothing loops over edges or
 pixels and nothing waits for the device: all index arithmetic happens on the host, once per change of the graph.
+Own code: the number of steps and their damping are part of the published method, and each pixel is an unknown.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ _CHECK_ITERATIONS = 1  # of a cut that is only to agree so far
 _MIN_FOUND = 0.6
 _MAX_STILL = 0.4
 _FOUND_BONUS = 0.1
-_MOTION_RELIEF = 0.1  # ... a mask that motion could have spoken against needs less, ...
+_MOTION_RELIEF = 0.1  # ... a mask that motion could have contradicted needs less, ...
 _COARSE_BENEFIT = 0.15  # ... and one that misses this little gets a closer look; ...
 CUT_SURCHARGE = 0.1  # ... one that the border cuts needs more, since part of a silhouette fits many things.
 _UNMOVED_SURCHARGE = 0.16
@@ -265,7 +265,7 @@ class Search:
             required -= _MOTION_RELIEF
         if not touches_border(mask):
             return required
-        # So does most of the background, and nothing has spoken against it before it has moved.
+        # So does most of the background, and nothing contradicts it before it has moved.
         return required + (CUT_SURCHARGE if motion is not None else _UNMOVED_SURCHARGE)
 
 

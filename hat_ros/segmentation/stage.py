@@ -1,4 +1,4 @@
-"""Stage 1 as the tracker and the node see it: one backend, its masks checked before anyone else trusts them."""
+"""Stage 1 as the tracker and the node see it: one backend, its masks checked before they are used."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """How far to trust the predicted rotation of a track: a Kalman filter that reads its process noise off the images.
 
-From some directions an outline says little about a rotation: a cylinder about its axis, a plate about its normal. What
+From some directions an outline tells little about a rotation: a cylinder about its axis, a plate about its normal. What
 earlier images said must then last, as long as the prediction from frame to frame deserves it, and no longer: relative
 motion may be exact to a tenth of a degree or, with the wrong relief, off by degrees at every frame. Its own sigma does
 not tell these apart; the turns between what single images said do.
@@ -21,7 +21,7 @@ from hat_ros.geometry import lie
 _HISTORY, _MIN_MEASURED = 14, 8
 # Drifts of the prediction that are told apart, rad per frame; none is trusted more than the first.
 _DRIFTS_RAD = np.radians(np.geomspace(0.25, 5.0, 24))
-# Degrees of freedom of the heavy-tailed likelihood: one bad mask says little.
+# Degrees of freedom of the heavy-tailed likelihood: one bad mask counts little.
 _TAIL = 4.0
 # The largest drift whose log-likelihood is short of the best by no more than this is assumed: trust has to be earned,
 # and successive images err together.

@@ -167,10 +167,10 @@ def test_opposite_quaternions_are_the_same_candidates():
     assert [s.selected for s in _run(keyframes)] == [s.selected for s in _run(flipped)]
 
 
-def test_motion_overrules_appearance_and_keeps_the_rival_alive():
-    """A half-turn rival wins one keyframe on appearance; later evidence may still bring it back."""
-    rival = lie.so3_exp(np.array([0, np.pi, 0]))
-    T = lie.transform(np.stack([np.eye(3), rival]), np.array([[0.0, 0, 5]] * 2))
+def test_motion_overrules_appearance_and_keeps_the_competing_basin_alive():
+    """A half-turned candidate wins one keyframe on appearance; later evidence may still bring it back."""
+    half_turn = lie.so3_exp(np.array([0, np.pi, 0]))
+    T = lie.transform(np.stack([np.eye(3), half_turn]), np.array([[0.0, 0, 5]] * 2))
     still = _motion(np.eye(3))
 
     def keyframe(truth, other):

@@ -14,9 +14,9 @@ from hat_ros.geometry import lie
 from hat_ros.motion.droid import (
     DroidSlam,
     keep_volumes,
-    offline_motions,
     prepare,
     slam_rows,
+    whole_clip_motions,
 )
 from hat_ros.nets.droid import DroidNet
 from hat_ros.stages import create_backend
@@ -178,7 +178,7 @@ def test_reset_and_camera_change_start_a_new_epoch(clip):
 def test_offline_reference_gives_every_frame_a_pose(clip):
     pairs = list(zip(clip.frames, clip.detections, strict=True))
     pairs[7] = (pairs[7][0], None)
-    motions = offline_motions(oracle_config(clip), pairs, FlowOracle(clip))
+    motions = whole_clip_motions(oracle_config(clip), pairs, FlowOracle(clip))
     assert [motion.valid for motion in motions] == [i != 7 for i in range(len(pairs))]
     T_slam_cam = np.stack([motion.T_slam_cam for motion in motions if motion.valid])
     rotation_deg, translation, _ = similarity_errors(T_slam_cam, np.delete(clip.T_cam_target, 7, axis=0))
@@ -190,8 +190,8 @@ def test_offline_reference_gives_every_frame_a_pose(clip):
 def test_offline_reference_needs_motion(clip):
     pairs = [(clip.frames[0], clip.detections[0])] * 3
     with pytest.raises(RunError, match="warm-up needs 8"):
-        offline_motions(oracle_config(clip), pairs, FlowOracle(clip))
-    assert offline_motions(oracle_config(clip), [(clip.frames[0], None)], FlowOracle(clip))[0].valid is False
+        whole_clip_motions(oracle_config(clip), pairs, FlowOracle(clip))
+    assert whole_clip_motions(oracle_config(clip), [(clip.frames[0], None)], FlowOracle(clip))[0].valid is False
 
 
 @pytest.mark.gpu

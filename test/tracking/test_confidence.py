@@ -34,7 +34,7 @@ def test_a_clear_lead_of_the_outputs_basin_is_needed():
     assert not _after(_selection(0.0, -CONFIG.min_margin + 0.1)).is_certain(confirmed=True)
 
 
-def test_a_lead_of_another_basin_speaks_against_the_output():
+def test_a_lead_of_another_basin_contradicts_the_output():
     confidence = _after(_selection(0.0, -20.0), output=WRONG)
     assert confidence.margin == -20.0
     assert not confidence.is_certain(confirmed=True)

@@ -110,7 +110,7 @@ def test_one_wrong_anchor_is_outvoted_by_the_image(scene):
 
 
 def test_a_wrong_start_is_left_as_soon_as_the_anchors_say_so(scene):
-    """Before the warm-up one anchor is enough, unless the image speaks against it."""
+    """Before the warm-up one anchor is enough, unless the image contradicts it."""
     estimates = _run(_stage(scene), scene, range(40), lambda i, T: _flipped(T) if i == 0 else T)
     errors = _errors(estimates, scene, range(40))
     assert (errors[:8] > 170).all()
@@ -265,7 +265,7 @@ def test_anchors_that_no_image_has_supported_support_no_track(scene):
 
 
 @pytest.mark.parametrize(("lead", "left_after"), [(1.0, 1), (6.0, 4)])
-def test_anchors_that_barely_won_give_a_track_no_seniority(scene, lead, left_after):
+def test_anchors_with_a_small_margin_do_not_support_a_track(scene, lead, left_after):
     """The decoder remembers how close it was: where it changes its mind, as many more anchors would only be late."""
     keyframes = np.flatnonzero(scene.observations.key)
     stage = _stage(scene, lambda _: {"true": (0.8, 0.8), "flipped": (0.8, 0.8)})

@@ -23,7 +23,7 @@ from hat_ros.config import HatConfig
 from hat_ros.geometry import lie
 from hat_ros.motion.stage import suppress_background
 from hat_ros.refinement.contour_refiner import ContourRefiner
-from hat_ros.stages import PoseRefiner, offline_motions_of
+from hat_ros.stages import PoseRefiner, whole_clip_motions_of
 from hat_ros.target.model import Target
 from hat_ros.tracker import StageWrapper, Step
 from hat_ros.tracking.image_fusion import is_supported, quality
@@ -44,7 +44,7 @@ class Offline:
         self._config = config
         self._hat = Hat(config, target, wrap)
         self._refiner = ContourRefiner(config.refinement, target) if config.refinement.enabled else None
-        self._offline_motions = offline_motions_of(config)
+        self._whole_clip_motions = whole_clip_motions_of(config)
         self._steps: list[Step] = []
         self._images = _StoredClip(config.slam.masked)
 
@@ -52,7 +52,7 @@ class Offline:
         """Observe; the estimate in the returned step is the causal one."""
         step = self._hat.step(frame)
         self._steps.append(replace(step, detection=None))
-        if self._refiner is not None or self._offline_motions is not None:
+        if self._refiner is not None or self._whole_clip_motions is not None:
             self._images.append(frame, step.detection)
         return step
 
@@ -89,9 +89,9 @@ class Offline:
     def _motions(self) -> list[Motion]:
         """Adjusted over the whole clip where the backend can; not for a clip on which it never started."""
         causal = [step.motion for step in self._steps]
-        if self._offline_motions is None or not any(motion.valid for motion in causal):
+        if self._whole_clip_motions is None or not any(motion.valid for motion in causal):
             return causal
-        return self._offline_motions(self._config, self._images)
+        return self._whole_clip_motions(self._config, self._images)
 
     def _best_known(self, T_decided: Float, tied: Bool) -> Float:
         """Poses (N, 4, 4): the decided ones, and the causal ones where no motion ties the decided to other frames.

@@ -11,7 +11,7 @@ from hat_ros.bench.synth.models import build_target
 from hat_ros.config import config_from_dict
 from hat_ros.errors import UsageError
 from hat_ros.geometry import lie
-from hat_ros.stages import BACKENDS, OFFLINE_MOTIONS
+from hat_ros.stages import BACKENDS, WHOLE_CLIP_MOTIONS
 from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.tracker import HatTracker, unwrapped
 from hat_ros.types import Camera, Frame, TrackState
@@ -153,7 +153,7 @@ def test_offline_leaves_the_causal_pose_where_an_anchor_stands_alone(frames, tar
 
 
 def test_offline_takes_the_motion_of_the_whole_clip_where_the_backend_has_one(frames, target, monkeypatch):
-    monkeypatch.setitem(OFFLINE_MOTIONS, "knowing", "scripted_backends:knowing_whole_clip")
+    monkeypatch.setitem(WHOLE_CLIP_MOTIONS, "knowing", "scripted_backends:knowing_whole_clip")
     monkeypatch.setitem(BACKENDS["slam"], "knowing", "scripted_backends:ReversedSlam")
     steps, method = run("offline", frames, target, slam={"backend": "knowing"})
     assert errors_deg([step.estimate for step in steps][6:]).max() > 5.0, "reversed motion misleads the causal pose"
