@@ -43,12 +43,14 @@ class Stage:
         without: names of files among them that the default preset does not run.
         options: prefixes of configuration keys.
         without_options: prefixes among them that it does not use.
+        in_banks: whether the banks of views depend on them, which are kept in the cache folder under other keys.
     """
 
     files: tuple[str, ...]
     without: tuple[str, ...] = ()
     options: tuple[str, ...] = ()
     without_options: tuple[str, ...] = ()
+    in_banks: bool = False
 
 
 STAGES = {
@@ -63,6 +65,7 @@ STAGES = {
         ("megapose.py", "gigapose.py", "picopose.py", "picopose_templates.py"),
         ("hypotheses.", "keyframes."),
         ("hypotheses.megapose.", "hypotheses.picopose."),
+        in_banks=True,
     ),
     "motion": Stage(
         ("motion/*.py",),
@@ -71,7 +74,9 @@ STAGES = {
         ("slam.droid.",),
     ),
     "refinement and tracking": Stage(
-        ("refinement/*.py", "tracking/*.py"), options=("refinement.", "fusion.", "prior.")
+        ("refinement/*.py", "tracking/*.py"),
+        options=("refinement.", "fusion.", "prior."),
+        in_banks=True,
     ),
 }
 
@@ -209,19 +214,42 @@ def _scaled(value: Value, factor: float, name: str) -> Value:
     return max(1, round(value * factor)) if value > 0 else min(-1, round(value * factor))
 
 
-def mutated_copy(folder: Path, changed: Sequence[Constant], factor: float) -> Path:
-    """A copy of the package with scaled constants: the folder to put on PYTHONPATH."""
+def mutated_copy(folder: Path, changed: Sequence[Constant], factor: float, like: Path = ROOT) -> Path:
+    """A copy of a folder's package with scaled constants: the folder to put on PYTHONPATH.
+
+    Of another copy, the compiled code comes along, but for the modules that import a changed one: constants are
+    compiled in. The checkout's may be older than its constants.
+    """
     package = folder / "hat_ros"
-    shutil.copytree(ROOT / "hat_ros", package, ignore=shutil.ignore_patterns("__pycache__"))
-    for path in {constant.path for constant in changed if constant.path is not None}:
+    shutil.copytree(like / "hat_ros", package, ignore=shutil.ignore_patterns("__pycache__") if like == ROOT else None)
+    paths = {constant.path for constant in changed if constant.path is not None}
+    for path in paths:
         source = (package / path).read_bytes()
         mine = [constant for constant in changed if constant.path == path]
         for constant in sorted(mine, key=lambda c: c.span, reverse=True):
             start, end = constant.span
             source = source[:start] + repr(constant.scaled(factor)).encode() + source[end:]
         (package / path).write_bytes(source)
+    for path in _importing(package, paths):
+        for compiled in (package / path).parent.glob(f"__pycache__/{Path(path).stem}.*"):
+            compiled.unlink()
     _write_configuration(package / "config" / "presets" / "default.yaml", changed, factor)
     return folder
+
+
+def _importing(package: Path, changed: set[str]) -> set[str]:
+    """Source files that import one of some files, directly or through others, and those files themselves."""
+    imports: dict[str, set[str]] = {}
+    for path in package.rglob("*.py"):
+        nodes = [node for node in ast.walk(ast.parse(path.read_bytes())) if isinstance(node, ast.ImportFrom)]
+        modules = {node.module or "" for node in nodes}
+        modules |= {f"{node.module}.{alias.name}" for node in nodes for alias in node.names}  # it may be a module
+        files = {f"{module.removeprefix('hat_ros.').replace('.', '/')}.py" for module in modules}
+        imports[path.relative_to(package).as_posix()] = files
+    found = set(changed)
+    while more := {path for path, files in imports.items() if files & found} - found:
+        found |= more
+    return found
 
 
 def _write_configuration(preset: Path, changed: Sequence[Constant], factor: float) -> None:
@@ -244,9 +272,8 @@ def _write_configuration(preset: Path, changed: Sequence[Constant], factor: floa
 def run_gate(folder: Path, clips: Path, cache: Path, all_clips: bool) -> Verdict:
     """Run the checkout's gate on the package in a folder."""
     report = folder / "report.xml"
-    environment = os.environ | {
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"} | {
         "PYTHONPATH": str(folder),
-        "NUMBA_CACHE_DIR": str(folder / "numba"),
         "XDG_CACHE_HOME": str(cache),
         "ACCURACY_CLIPS": str(clips),
     }
@@ -311,9 +338,9 @@ def _run_all(runs: list[tuple[str, float, list[Constant]]], work: Path, options:
 
     def run(number: int) -> bool:
         name, factor, changed = runs[number]
-        # Banks of views depend on constants that are not part of their keys.
-        folder = mutated_copy(work / f"run{number}", changed, factor)
-        verdict = run_gate(folder, clips, caches / f"run{number}", options.all_clips)
+        folder = mutated_copy(work / f"run{number}", changed, factor, work / "unchanged")
+        cache = caches / (f"run{number}" if STAGES[name].in_banks else "unchanged")
+        verdict = run_gate(folder, clips, cache, options.all_clips)
         text, good = _judge(verdict, unchanged)
         print(f"{name:24s} {factor:6g} {len(changed):9d}  {text}", flush=True)
         shutil.rmtree(folder)

@@ -21,36 +21,41 @@ RECORDERS = {"demo": record_demo} | {clip.name: clip.record for clip in CLIPS}
 
 
 class Recordings:
-    """Renders the next clip in a thread while the present one is tracked."""
+    """Renders the next clip in a thread while the present one is tracked.
 
-    def __init__(self, pool: ThreadPoolExecutor) -> None:
+    Args:
+        names: the clips, in the order in which they are asked for.
+        pool: renders them.
+    """
+
+    def __init__(self, names: list[str], pool: ThreadPoolExecutor) -> None:
+        self._rest = iter(names)
         self._pool = pool
-        self._next = dict(zip(RECORDERS, [*RECORDERS][1:], strict=False))
-        self._started = {}
+        self._ahead = self._start()
 
-    def __getitem__(self, name: str) -> Recording:
-        recording = self._start(name).result()
-        if name in self._next:
-            self._start(self._next[name])
-        self._started.pop(name)  # each is used once, and large
+    def take(self, name: str) -> Recording:
+        asked, recording = self._ahead.result()
+        assert asked == name, "the clips must be asked for in order"
+        self._ahead = self._start()
         return recording
 
-    def _start(self, name: str):
-        if name not in self._started:
-            self._started[name] = self._pool.submit(RECORDERS[name])
-        return self._started[name]
+    def _start(self):
+        name = next(self._rest, None)
+        return None if name is None else self._pool.submit(lambda: (name, RECORDERS[name]()))
 
 
 @pytest.fixture(scope="module")
-def recordings() -> Iterator[Recordings]:
-    pool = ThreadPoolExecutor(1)
-    yield Recordings(pool)
-    pool.shutdown(cancel_futures=True)
+def recordings(request) -> Iterator[Recordings]:
+    items = [item for item in request.session.items if item.path == request.path and hasattr(item, "callspec")]
+    names = [item.callspec.params["name"] for item in items]
+    with ThreadPoolExecutor(1) as pool:
+        yield Recordings(names, pool)
+        pool.shutdown(cancel_futures=True)
 
 
 @pytest.mark.parametrize("name", RECORDERS)
 def test_clip_stays_within_its_bands(name, recordings, table, record_property):
-    outcome = measure(recordings[name])
+    outcome = measure(recordings.take(name))
     left = bands_left(outcome.figures, BANDS[name])
     # For tools/mutate.py, in the JUnit report.
     record_property("clip", name)

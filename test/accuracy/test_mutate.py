@@ -86,6 +86,29 @@ def test_the_copy_has_the_scaled_values_and_the_checkout_has_not(mutate, tmp_pat
     assert values(folder) == [2 * value for value in values(SOURCE.parents[1])]
 
 
+def test_compiled_code_is_dropped_where_a_changed_constant_may_be_compiled_in(mutate, tmp_path):
+    like = tmp_path / "like" / "hat_ros"
+    texts = {
+        "room/a.py": "_C = 2",
+        "room/b.py": "from hat_ros.room.a import _C",
+        "other/c.py": "from hat_ros.room import b",
+        "other/d.py": "import numpy",
+        "config/presets/default.yaml": "",
+    }
+    for path, text in texts.items():
+        (like / path).parent.mkdir(parents=True, exist_ok=True)
+        (like / path).write_text(text, encoding="utf-8")
+    for path in ("room/a", "room/b", "other/c", "other/d"):
+        compiled = like / Path(path).parent / "__pycache__" / f"{Path(path).name}.f-1.py311.nbi"
+        compiled.parent.mkdir(exist_ok=True)
+        compiled.touch()
+    change = mutate.Constant("room/a._C", 2, "room/a.py", (5, 6))
+    package = mutate.mutated_copy(tmp_path / "copy", [change], 1.4, tmp_path / "like") / "hat_ros"
+    assert (package / "room/a.py").read_text(encoding="utf-8") == "_C = 3"
+    assert (like / "room/a.py").read_text(encoding="utf-8") == "_C = 2"
+    assert [path.name for path in package.rglob("*.nbi")] == ["d.f-1.py311.nbi"]
+
+
 @pytest.mark.parametrize("factor", [0.7, 1.4])
 def test_every_stage_has_constants_and_a_legal_copy(mutate, tmp_path, factor):
     for name, stage in mutate.STAGES.items():
