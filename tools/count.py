@@ -67,7 +67,7 @@ loaded = [m.__file__ for name, m in sys.modules.items() if name.split(".")[0] ==
 print(json.dumps({"files": loaded, "keys": list(keys(config))}))
 """
 # Where load_target lies, newest first.
-_TARGET_MODULES = ("hat_ros.target.model", "hat_ros.target")
+_TARGET_MODULES = ("hat_ros.target.loading", "hat_ros.target.model", "hat_ros.target")
 
 
 @dataclass(frozen=True)
