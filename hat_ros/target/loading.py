@@ -63,7 +63,7 @@ def target_from_scene(scene: trimesh.Scene, name: str, unit_scale: float = 1.0) 
     """
     if not (np.isfinite(unit_scale) and unit_scale > 0):
         raise MeshError(f"CAD model {name}: unit_scale must be a positive number, found {unit_scale}")
-    found = (_part(scene, node, name) for node in sorted(scene.graph.nodes_geometry))
+    found = (_part(scene, node, name) for node in _ordered_nodes(scene))
     parts = [part for part in found if part is not None]
     if not parts:
         raise MeshError(f"CAD model {name}: it holds no triangles; export the surface as a triangle mesh")
@@ -87,6 +87,19 @@ def target_from_scene(scene: trimesh.Scene, name: str, unit_scale: float = 1.0) 
     for array in (vertices, faces, face_rgb):
         array.setflags(write=False)
     return Target(name, vertices, faces, face_rgb, surface, digest.hexdigest())
+
+
+def _ordered_nodes(scene: trimesh.Scene) -> list[str]:
+    """Nodes with geometry, in the same order at every load.
+
+    By geometry and transform: trimesh makes up random names for the nodes of a glTF mesh of several materials.
+    """
+
+    def key(node: str) -> tuple[str, bytes]:
+        T, geometry_name = scene.graph[node]
+        return geometry_name, np.asarray(T, dtype=np.float64).tobytes()
+
+    return sorted(scene.graph.nodes_geometry, key=key)
 
 
 @dataclass(frozen=True)

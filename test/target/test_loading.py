@@ -1,5 +1,8 @@
 """CAD models: what is read, in which frame and colours, and what is refused."""
 
+import json
+import struct
+
 import numpy as np
 import pytest
 import trimesh
@@ -42,6 +45,29 @@ def test_unit_scale_scales_geometry_and_changes_the_hash(tmp_path):
     np.testing.assert_allclose(np.ptp(metres.vertices_m, axis=0), [0.1, 0.2, 0.3], atol=1e-6)
     assert metres.sha256 != load_target(path, 0.01).sha256
     assert metres.sha256 == load_target(path, 0.001).sha256
+
+
+def test_a_gltf_mesh_of_many_materials_is_the_same_at_every_load(tmp_path):
+    """trimesh gives the primitives of one node random names; the digest is the key of all caches."""
+    scene = trimesh.Scene()
+    for i in range(6):
+        part = box((0.1 * (i + 1), 0.2, 0.2))
+        part.visual = trimesh.visual.TextureVisuals(material=PBRMaterial(baseColorFactor=[0.1 * i, 0.5, 0.5, 1.0]))
+        scene.add_geometry(part, transform=trimesh.transformations.translation_matrix([0, 0, float(i)]))
+    path = tmp_path / "parts.glb"
+    scene.export(path)
+    data = path.read_bytes()
+    length = struct.unpack_from("<I", data, 12)[0]
+    document, binary = json.loads(data[20 : 20 + length]), data[20 + length :]
+    document["meshes"] = [{"name": "one", "primitives": [m["primitives"][0] for m in document["meshes"]]}]
+    document["nodes"], document["scenes"] = [{"name": "one", "mesh": 0}], [{"nodes": [0]}]
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    header = struct.pack("<4sII", b"glTF", 2, 20 + len(text) + len(binary)) + struct.pack("<I4s", len(text), b"JSON")
+    path.write_bytes(header + text + binary)
+    loads = [load_target(path) for _ in range(4)]
+    assert len(loads[0].faces) == 6 * 12
+    assert len({target.sha256 for target in loads}) == 1
 
 
 def test_face_colours_come_from_face_vertex_material_and_texture():
