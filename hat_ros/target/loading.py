@@ -97,7 +97,7 @@ def _ordered_nodes(scene: trimesh.Scene) -> list[str]:
 
     def key(node: str) -> tuple[str, bytes]:
         T, geometry_name = scene.graph[node]
-        return geometry_name, np.asarray(T, dtype=np.float64).tobytes()
+        return str(geometry_name), np.asarray(T, dtype=np.float64).tobytes()
 
     return sorted(scene.graph.nodes_geometry, key=key)
 
