@@ -24,9 +24,9 @@ from hat_ros.nets.checkpoint_registry import CHECKPOINTS  # noqa: E402
 INPUTS, OUTPUTS, STAGES, PEOPLE, RUN = "Inputs", "Outputs", "Between the stages", "For people", "The run itself"
 # Topic -> (group, from and to, how often, what it carries).
 ABOUT: dict[str, tuple[str, str, str, str]] = {
-    topics.IMAGE: (INPUTS, "camera to segmentation", "any", "rectified image; remap it"),
-    topics.IMAGE_COMPRESSED: (INPUTS, "camera to segmentation", "any", "the same as JPEG or PNG"),
-    topics.CAMERA_INFO: (INPUTS, "camera to segmentation", "any", "calibration of the image"),
+    topics.IMAGE: (INPUTS, "camera to segmentation", "any", "image, see [Cameras](cameras.md); remap it"),
+    topics.IMAGE_COMPRESSED: (INPUTS, "camera to segmentation", "any", "the same as JPEG, PNG, WebP or TIFF"),
+    topics.CAMERA_INFO: (INPUTS, "camera to segmentation", "any", "calibration of the image; its distortion is undone"),
     topics.DETECTION_MASK: (
         INPUTS,
         "detector to segmentation",

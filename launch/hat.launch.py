@@ -20,15 +20,23 @@ ARGUMENTS = (
     ("config", "default", "preset or YAML file"),
     ("target", None, "CAD model (obj, ply, stl, glb) or target.yaml"),
     ("live", "true", "one frame in flight, the newest wins; false: nothing may be dropped"),
-    ("image", "/image", "topic of the rectified image; compressed images on <image>/compressed"),
+    ("image", "/image", "topic of the image; compressed images on <image>/compressed"),
     ("camera_info", "/camera_info", "topic of its calibration"),
+    (
+        "rectified",
+        "auto",
+        "which image it describes: true (P), false (K, D is undone), auto: by the image topic's name",
+    ),
+    ("image_depth", "auto", "significant bits of 16-bit images, 8 to 16"),
     ("overlay", "true", "offer /hat/overlay/compressed"),
 )
 
 
 def generate_launch_description() -> LaunchDescription:
     arguments = [DeclareLaunchArgument(name, default_value=value, description=doc) for name, value, doc in ARGUMENTS]
-    parameters = [{name: LaunchConfiguration(name) for name in ("config", "target", "live")}]
+    values = {name: LaunchConfiguration(name) for name in ("config", "target", "live")}
+    values |= {f"camera.{name}": LaunchConfiguration(name) for name in ("rectified", "image_depth")}
+    parameters = [values]
     image = LaunchConfiguration("image")
     remappings = [
         ("/image", image),

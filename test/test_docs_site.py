@@ -10,7 +10,9 @@ import yaml
 
 import hat_ros
 from hat_ros.config import flat_options
-from hat_ros.io import topics
+from hat_ros.io import compressed, topics
+from hat_ros.io.encodings import encoding_names
+from hat_ros.io.lens import MODELS
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("docs/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "bags" / "README.md"])
@@ -157,3 +159,15 @@ def test_launch_arguments_and_node_parameters_are_in_the_reference():
     for name, (_, doc) in params._RUN_OPTIONS.items():
         assert re.search(rf"\| `{name}` \| `.*` \| {re.escape(doc)} \|", page)
     assert "| `camera_info` | `/camera_info` |" in page
+
+
+def test_encodings_and_formats_of_the_cameras_page_are_those_that_are_read():
+    sections = dict(part.split("\n", 1) for part in read(ROOT / "docs" / "cameras.md").split("\n## ")[1:])
+    rows = [line.split(" | ")[0] for line in sections["Encodings"].splitlines() if line.startswith("| `")]
+    listed = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
+    assert sorted(listed) == sorted((*encoding_names(), *compressed.FORMATS))
+
+
+def test_lens_models_of_the_cameras_page_are_those_that_are_undone():
+    text = re.search(r"The models are (.*?)\. Given", read(ROOT / "docs" / "cameras.md"), re.DOTALL)[1]
+    assert sorted(re.findall(r"`(\w+)`", text)) == sorted(MODELS)

@@ -88,6 +88,7 @@ class Pipeline:
         self._credits = credits if self._method.concurrent else 1
         self._admission = Admission(self._credits)
         self.rejected = 0
+        self.first_rejection = ""
 
     @property
     def causal(self) -> bool:
@@ -138,8 +139,9 @@ class Pipeline:
                 if isinstance(frame, FrameError):
                     raise frame
                 seq = self._admission.admit(frame.stamp_ns)
-            except FrameError:
+            except FrameError as error:
                 self.rejected += 1
+                self.first_rejection = self.first_rejection or str(error)
                 continue
             yield seq, frame, decode_ms
 

@@ -15,12 +15,11 @@ from hat_ros.array_types import Float, UInt8
 from hat_ros.bench.datasets.image_files import ImageRecording
 from hat_ros.bench.datasets.importer import open_dataset, with_annotation_boxes, with_detections
 from hat_ros.bench.datasets.sequence import load_sequence
+from hat_ros.config import CameraConfig
 from hat_ros.errors import BagError, DatasetError, FrameError, UsageError
 from hat_ros.geometry import lie
-from hat_ros.io.bag_reader import BagReader, Packet
-from hat_ros.io.images import decode_image, decode_mask
+from hat_ros.io.bag_reader import BagReader
 from hat_ros.io.provenance import input_hash
-from hat_ros.io.rosbag import deserialize
 from hat_ros.target.loading import load_target
 from hat_ros.target.model import Target
 from hat_ros.types import Frame
@@ -84,8 +83,11 @@ class SourceSpec:
             "detections_sha256": None if self.detections is None else input_hash(self.detections),
         }
 
-    def open(self) -> Source:
+    def open(self, camera_config: CameraConfig | None = None) -> Source:
         """Open the recording and its CAD model.
+
+        Args:
+            camera_config: what the messages of a bag do not say of the camera; None = find out.
 
         Raises:
             UsageError: there is nothing of that name, or it is no recording.
@@ -93,7 +95,7 @@ class SourceSpec:
         """
         if self.dataset:
             return _source_of_images(self.path, self._in_dataset())
-        return open_source(self.path, self.detections)
+        return open_source(self.path, self.detections, camera_config)
 
     def _in_dataset(self) -> ImageRecording:
         for recording in open_dataset(self.dataset, self.path, self.model, (self.sequence,)):
@@ -119,7 +121,7 @@ class Source:
         """
         stop, recording = None if limit is None else start + limit, self.recording
         if isinstance(recording, BagReader):
-            return islice(_attempts(recording, masks), start, stop)
+            return _attempts(recording, masks, start, stop)
         return islice(recording.frames(stop, masks), start, stop)
 
     def masks(self, start: int = 0, limit: int | None = None) -> Iterator[tuple[int, UInt8 | None]]:
@@ -146,33 +148,29 @@ class Source:
         return {stamp: lie.row_from_matrix(T) for stamp, T in self.recording.truth().items()}
 
 
-def _attempts(bag: BagReader, masks: bool) -> Iterator[Frame | FrameError]:
-    """The frames of a bag; one that cannot be decoded does not end the stream."""
-    for packet in bag.packets():
-        kind = f"sensor_msgs/msg/{'CompressedImage' if packet.compressed else 'Image'}"
+def _attempts(bag: BagReader, masks: bool, start: int, stop: int | None) -> Iterator[Frame | FrameError]:
+    """The frames of a bag; one that cannot be decoded does not end the stream. Those left out are not looked at."""
+    decoder = bag.decoder()
+    for packet in islice(bag.packets(), start, stop):
         try:
-            rgb = decode_image(deserialize(packet.image, kind, bag.path))
-            yield Frame(packet.stamp_ns, rgb, bag.camera, _mask_of(packet, bag) if masks else None)
+            frame = bag.decoded(packet, decoder, masks)
         except FrameError as error:
-            yield error
+            yield FrameError(f"frame {packet.stamp_ns}: {error}")
+            continue
+        yield frame
 
 
 def _masks(bag: BagReader) -> Iterator[tuple[int, UInt8 | None]]:
     """Stamps and masks of a bag; None for one that cannot be decoded."""
+    decoder = bag.decoder()
     for packet in bag.packets():
         mask = None
         with suppress(FrameError):
-            mask = _mask_of(packet, bag)
+            mask = bag.decoded_mask(packet, decoder)
         yield packet.stamp_ns, mask
 
 
-def _mask_of(packet: Packet, bag: BagReader) -> UInt8 | None:
-    if packet.mask is None:
-        return None
-    return decode_mask(deserialize(packet.mask, "sensor_msgs/msg/Image", bag.path))
-
-
-def open_source(path: str | Path, detections: Path | None = None) -> Source:
+def open_source(path: str | Path, detections: Path | None = None, camera_config: CameraConfig | None = None) -> Source:
     """Open a bag or a folder of the ``sequence`` layout, and the CAD model beside it; see :meth:`SourceSpec.open`."""
     path = Path(path)
     if not path.exists():
@@ -184,7 +182,7 @@ def open_source(path: str | Path, detections: Path | None = None) -> Source:
         raise UsageError(f"recording {path}: neither a bag (metadata.yaml) nor a sequence folder (labels.json)")
     if detections is not None:
         raise UsageError(f"recording {path}: a bag has its detections in it; give --detections to `hat import`")
-    bag = BagReader(path)
+    bag = BagReader(path, camera_config=camera_config)
     if bag.target_path is None:
         raise BagError(f"{path} has no target.yaml: put the CAD model and a target.yaml that names it into the folder")
     return Source(path, bag, load_target(bag.target_path))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hat_ros.bench.methods.modes import MODES
-from hat_ros.cli.options import Commands, add_config, add_dataset, natural, positive
+from hat_ros.cli.options import Commands, add_camera, add_config, add_dataset, natural, positive
 
 if TYPE_CHECKING:
     from hat_ros.bench.experiments.comparison import Clip
@@ -44,6 +44,7 @@ def _add_run_matrix(parser: argparse.ArgumentParser) -> None:
         "--out", required=True, type=Path, metavar="DIR", help="folder of the runs; resumed if it exists"
     )
     add_config(parser)
+    add_camera(parser)
     parser.add_argument("--limit", type=positive, metavar="N", help="at most N frames per run")
     parser.add_argument("--jobs", type=positive, default=1, metavar="N", help="runs at a time (default: 1)")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +38,46 @@ def add_overrides(parser: argparse.ArgumentParser) -> None:
         metavar="KEY=VALUE",
         help="override one value, e.g. --set keyframes.gap_frames=4 (may be repeated)",
     )
+
+
+def add_camera(parser: argparse.ArgumentParser) -> None:
+    """``--rectified`` and ``--image-depth``: what the messages of a camera do not say."""
+    parser.add_argument(
+        "--rectified",
+        dest="overrides",
+        action="append",
+        type=_camera_word("rectified"),
+        default=[],
+        metavar="auto|true|false",
+        help="which image camera_info describes: true: rectified, by P; false: raw, by K, and the distortion D is "
+        "undone; auto: by the topic's name (default: auto)",
+    )
+    parser.add_argument(
+        "--image-depth",
+        dest="overrides",
+        action="append",
+        type=_camera_word("image_depth"),
+        default=[],
+        metavar="auto|8..16",
+        help="significant bits of 16-bit images (default: auto)",
+    )
+
+
+def _camera_word(name: str) -> Callable[[str], str]:
+    """A word that the parameter accepts, as its override."""
+
+    def parse(text: str) -> str:
+        from hat_ros.config import load_config
+        from hat_ros.errors import ConfigError
+
+        override = f"camera.{name}={text}"
+        try:
+            load_config("default", [override])
+        except ConfigError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+        return override
+
+    return parse
 
 
 def config_of(arguments: argparse.Namespace) -> HatConfig:

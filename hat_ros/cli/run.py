@@ -8,6 +8,7 @@ from pathlib import Path
 from hat_ros.bench.methods.modes import MODES
 from hat_ros.cli.options import (
     Commands,
+    add_camera,
     add_config,
     add_dataset,
     add_extent,
@@ -45,6 +46,7 @@ def _add_replay(commands: Commands) -> None:
         default="processes",
         help="five processes, or all nodes in one (default: processes)",
     )
+    add_camera(parser)
     _add_credits(parser, "graph.credits_replay")
     parser.add_argument("--live", action="store_true", help="play in real time; frames are dropped, not queued")
     parser.add_argument("--rate", type=float, default=1.0, metavar="X", help="speed of --live play (default: 1)")
@@ -106,6 +108,7 @@ def _add_track(commands: Commands) -> None:
         "offline: all frames jointly (whole-clip smoothing, not causal); srt3d: region tracker started by the best "
         "hypothesis; observe: front ends only, candidates at every frame, no poses (default: hat)",
     )
+    add_camera(parser)
     _add_credits(parser, "2, or graph.credits_replay where that is less")
     add_extent(parser)
     add_threads(parser)

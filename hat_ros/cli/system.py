@@ -7,6 +7,7 @@ from pathlib import Path
 
 from hat_ros.cli.options import (
     Commands,
+    add_camera,
     add_config,
     add_dataset,
     add_threads,
@@ -111,6 +112,7 @@ def _add_profile(commands: Commands) -> None:
     add_dataset(parser)
     parser.add_argument("--sequence", default="", metavar="NAME", help="which sequence of the data set")
     add_config(parser)
+    add_camera(parser)
     parser.add_argument("--limit", type=positive, metavar="N", help="at most N frames (default: all)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there as well")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
@@ -124,9 +126,10 @@ def _profile(arguments: argparse.Namespace) -> int:
     from hat_ros.cli.console import state_progress
     from hat_ros.io.results import write_json
 
-    source = spec_of(arguments).open()
+    config = config_of(arguments)
+    source = spec_of(arguments).open(config.camera)
     with state_progress("profiling", arguments.quiet) as watch:
-        measured = profile(source, config_of(arguments), arguments.limit, watch)
+        measured = profile(source, config, arguments.limit, watch)
     print(measured.table().text())
     for name, value in measured.summary().items():
         print(f"{name}: {value:.1f}" if isinstance(value, float) else f"{name}: {value}")

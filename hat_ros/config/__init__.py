@@ -34,12 +34,13 @@ from hat_ros.config.loader import (
     preset_names,
 )
 from hat_ros.config.option import LEVELS, Level, describe
-from hat_ros.config.schema import GraphConfig, HatConfig, NetsConfig
+from hat_ros.config.schema import CameraConfig, GraphConfig, HatConfig, NetsConfig
 from hat_ros.config.text import commented_yaml, differences, value_text
 
 __all__ = [
     "LEVELS",
     "AlignmentConfig",
+    "CameraConfig",
     "ClassicalConfig",
     "DroidConfig",
     "FeatureSlamConfig",

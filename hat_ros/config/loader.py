@@ -190,6 +190,8 @@ def _check(name: str, value: object, hint: type, metadata: Mapping[str, Any]) ->
     """
     if hint is float and isinstance(value, str) and _NUMBER_WITH_EXPONENT.fullmatch(value):
         value = float(value)
+    if hint is str and metadata["choices"] and isinstance(value, (bool, int)):
+        value = str(value).lower()  # a word that YAML and ROS take for something else: true, 12
     accepts = (int, float) if hint is float else (hint,)
     if not isinstance(value, accepts) or (isinstance(value, bool) and hint is not bool):
         raise ConfigError(f"{name}: expected {hint.__name__}, found {value!r} ({type(value).__name__})")

@@ -42,6 +42,26 @@ class NetsConfig:
 
 
 @dataclass(frozen=True)
+class CameraConfig:
+    """What the messages of a camera do not say."""
+
+    rectified: str = option(
+        "auto",
+        "which image camera_info describes: true (rectified: P), false (raw: K, and the distortion D is undone), "
+        "auto (by the topic's name)",
+        level="basic",
+        choices=("auto", "true", "false"),
+    )
+    image_depth: str = option(
+        "auto",
+        "significant bits of 16-bit images: 8 to 16, or auto (the smallest of 10, 12, 14, 16 that holds all values "
+        "seen so far)",
+        level="basic",
+        choices=("auto", "8", "9", "10", "11", "12", "13", "14", "15", "16"),
+    )
+
+
+@dataclass(frozen=True)
 class GraphConfig:
     """The ROS graph."""
 
@@ -71,6 +91,7 @@ class GraphConfig:
 class HatConfig:
     """The whole configuration; one attribute per section of the YAML file."""
 
+    camera: CameraConfig = field(default_factory=CameraConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
     hypotheses: HypothesesConfig = field(default_factory=HypothesesConfig)

@@ -13,11 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from hat_ros.array_types import Float
+from hat_ros.array_types import Float, UInt8
+from hat_ros.config import CameraConfig
 from hat_ros.errors import BagError, FrameError, HatError
 from hat_ros.geometry import lie
 from hat_ros.io import messages, topics
-from hat_ros.io.images import decode_image, decode_mask
+from hat_ros.io.calibration import Calibration, calibration_from
+from hat_ros.io.frame_decoder import FrameDecoder
 from hat_ros.io.integrity import check_mcap
 from hat_ros.io.manifest import TARGET_FILE, check_manifest
 from hat_ros.io.rosbag import deserialize, opened_bag, stamp_of_cdr
@@ -57,6 +59,7 @@ class BagReader:
         camera_info_topic: topic of the calibration; found likewise.
         mask_topic: topic of given detections (mono8: 255 silhouette, 128 box, 0 outside).
         truth_topic: topic of true poses (PoseStamped, ``T_cam_target``); only for evaluation.
+        camera_config: what the messages do not say of the camera; None = find out.
 
     Raises:
         BagError: missing, truncated or altered bag, or a topic that is missing, ambiguous or of another type.
@@ -71,8 +74,11 @@ class BagReader:
         camera_info_topic: str | None = None,
         mask_topic: str = topics.DETECTION_MASK,
         truth_topic: str = topics.GROUND_TRUTH,
+        camera_config: CameraConfig | None = None,
     ) -> None:
         self.path = Path(path)
+        self._camera_config = camera_config or CameraConfig()
+        self._has_decoder = False
         self._check_files()
         with opened_bag(self.path) as reader:
             self._types = {c.topic: c.msgtype for c in reader.connections}
@@ -156,22 +162,47 @@ class BagReader:
         return path if path.is_file() else None
 
     @cached_property
-    def camera(self) -> Camera:
-        """The calibration; one for the whole bag."""
-        camera: Camera | None = None
+    def calibration(self) -> Calibration:
+        """The calibration; one for the whole bag. Messages that say "not calibrated" are skipped.
+
+        Raises:
+            BagError: there is none, or it changes.
+            FrameError: it is unusable, or does not say which image it describes.
+        """
+        first: Calibration | None = None
         for message in self.messages(self.camera_info_topic):
             try:
-                found = messages.camera_from(message)
+                found = calibration_from(message, self.image_topic, self._camera_config.rectified)
             except HatError as error:
                 raise FrameError(f"{self.path}, {self.camera_info_topic}: {error}") from None
-            if camera is not None and not messages.same_camera(camera, found):
+            if found is None:
+                continue
+            first = first or found
+            if not first.is_same(found):
                 raise BagError(
                     f"{self.path}: the calibration changes at stamp {messages.stamp_of(message)}: split the bag"
                 )
-            camera = found
-        if camera is None:
-            raise BagError(f"{self.path}: topic {self.camera_info_topic} has no message: the calibration is missing")
-        return camera
+        if first is None:
+            raise BagError(self._no_calibration())
+        return first
+
+    def _no_calibration(self) -> str:
+        topic = f"{self.path}: topic {self.camera_info_topic}"
+        if not self._counts[self.camera_info_topic]:
+            return f"{topic} has no message: the calibration is missing"
+        return (
+            f"{topic} says that the camera is not calibrated, K is all zero: calibrate it, or write K into the messages"
+        )
+
+    @property
+    def camera(self) -> Camera:
+        """The pinhole camera of all frames."""
+        return self.calibration.camera
+
+    def decoder(self) -> FrameDecoder:
+        """What decodes the frames of one pass over the bag; only that of the first pass logs."""
+        quiet, self._has_decoder = self._has_decoder, True
+        return FrameDecoder(self.calibration, self._camera_config.image_depth, quiet)
 
     @cached_property
     def frame_id(self) -> str:
@@ -185,14 +216,30 @@ class BagReader:
             BagError: the bag breaks off or cannot be deserialized.
             FrameError: an image or mask is malformed; the message names its stamp.
         """
-        kind, mask_kind = self._types[self.image_topic], _MASK_TYPE
+        decoder = self.decoder()
         for packet in self.packets():
             try:
-                rgb = decode_image(deserialize(packet.image, kind, self.path))
-                mask = None if packet.mask is None else decode_mask(deserialize(packet.mask, mask_kind, self.path))
+                yield self.decoded(packet, decoder)
             except FrameError as error:
                 raise FrameError(f"{self.path}, frame {packet.stamp_ns}: {error}") from None
-            yield Frame(packet.stamp_ns, rgb, self.camera, mask)
+
+    def decoded(self, packet: Packet, decoder: FrameDecoder, masks: bool = True) -> Frame:
+        """The frame of a packet, with its mask if wanted.
+
+        Raises:
+            BagError: a message cannot be deserialized.
+            FrameError: an image or mask is malformed.
+        """
+        image = deserialize(packet.image, self._types[self.image_topic], self.path)
+        return decoder.frame(packet.stamp_ns, image, self._mask_message(packet) if masks else None)
+
+    def decoded_mask(self, packet: Packet, decoder: FrameDecoder) -> UInt8 | None:
+        """The mask of a packet alone; errors as in :meth:`decoded`."""
+        message = self._mask_message(packet)
+        return None if message is None else decoder.mask(message)
+
+    def _mask_message(self, packet: Packet) -> Any | None:
+        return None if packet.mask is None else deserialize(packet.mask, _MASK_TYPE, self.path)
 
     def packets(self) -> Iterator[Packet]:
         """The images as recorded, each with the mask of its exact stamp."""

@@ -9,6 +9,8 @@ import numpy as np
 from hat_ros.array_types import UInt8
 from hat_ros.errors import FrameError, HatError, WireError
 from hat_ros.io import images
+from hat_ros.io.layout import pixels_of
+from hat_ros.io.lens import Lens
 from hat_ros.io.message_family import MessageFamily
 from hat_ros.types import Camera, Detection
 
@@ -16,8 +18,8 @@ from hat_ros.types import Camera, Detection
 class ImageWire(MessageFamily):
     """Encodes images and calibrations."""
 
-    def camera_info(self, stamp_ns: int, frame_id: str, camera: Camera) -> Any:
-        """CameraInfo of a camera without distortion."""
+    def camera_info(self, stamp_ns: int, frame_id: str, camera: Camera, lens: Lens | None = None) -> Any:
+        """CameraInfo of a camera; with a lens, of its raw images, whose rectified ones have the same matrix."""
         K = camera.K
         roi = self._class("sensor_msgs/msg/RegionOfInterest")(
             x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
@@ -26,8 +28,8 @@ class ImageWire(MessageFamily):
             header=self.header(stamp_ns, frame_id),
             height=int(camera.height),
             width=int(camera.width),
-            distortion_model="plumb_bob",
-            d=self._numbers([0.0] * 5),
+            distortion_model="plumb_bob" if lens is None else lens.model,
+            d=self._numbers([0.0] * 5 if lens is None else lens.coefficients),
             k=K.ravel().copy(),
             r=np.eye(3).ravel(),
             p=np.column_stack([K, np.zeros(3)]).ravel(),
@@ -61,24 +63,17 @@ class ImageWire(MessageFamily):
 
 
 def camera_from(message: Any) -> Camera:
-    """Decode a CameraInfo.
+    """Decode ``/hat/camera_info``; what a camera sends is decoded by :mod:`hat_ros.io.calibration`.
 
     Raises:
         FrameError: lens distortion, binning or a region of interest, or an impossible matrix.
     """
     d = np.asarray(message.d, dtype=np.float64)
     if d.size and (not np.isfinite(d).all() or d.any()):
-        raise FrameError(f"camera_info.d must be zero, found {d.tolist()}: rectify first and use image_rect")
+        raise FrameError(f"camera_info.d must be zero, found {d.tolist()}")
     if message.binning_x > 1 or message.binning_y > 1 or message.roi.width or message.roi.height:
-        raise FrameError("camera_info has binning or a region of interest: give the calibration of the image as it is")
+        raise FrameError("camera_info must have neither binning nor a region of interest")
     return Camera(np.array(message.k, dtype=np.float64).reshape(3, 3), int(message.width), int(message.height))
-
-
-def same_camera(a: Camera | None, b: Camera | None) -> bool:
-    """Whether two calibrations are identical."""
-    if a is None or b is None:
-        return a is b
-    return np.array_equal(a.K, b.K) and (a.width, a.height) == (b.width, b.height)
 
 
 def frame_from(message: Any) -> tuple[UInt8, Detection | None]:
@@ -90,6 +85,6 @@ def frame_from(message: Any) -> tuple[UInt8, Detection | None]:
     try:
         if message.encoding != "rgba8":
             raise WireError(f"encoding must be rgba8, found '{message.encoding}'")
-        return images.split_rgba(images.pixels_of(message, 4))
+        return images.split_rgba(pixels_of(message, 4))
     except HatError as error:
         raise WireError(f"/hat/frame: {error}") from None

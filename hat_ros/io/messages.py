@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from hat_ros.io.image_messages import ImageWire, camera_from, frame_from, same_camera
+from hat_ros.io.image_messages import ImageWire, camera_from, frame_from
 from hat_ros.io.message_family import message_class, stamp_of
 from hat_ros.io.pose_messages import PoseWire, pose_row_from
 from hat_ros.io.stage_tables import (
@@ -41,7 +41,6 @@ __all__ = [
     "motion_from",
     "pose_row_from",
     "read_table",
-    "same_camera",
     "selection_from",
     "stamp_of",
     "status_from",

@@ -8,8 +8,9 @@ from typing import Any
 from hat_ros.core.sync import Admission
 from hat_ros.errors import FrameError
 from hat_ros.io import messages
-from hat_ros.io.images import decode_image, decode_mask
-from hat_ros.types import Camera, Frame
+from hat_ros.io.calibration import Calibration
+from hat_ros.io.frame_decoder import FrameDecoder
+from hat_ros.types import Frame
 
 _MASKS_KEPT = 64
 
@@ -20,24 +21,30 @@ class Entrance:
     Args:
         live: keep only the newest image and count those that it replaces; otherwise all wait their turn.
         with_masks: a frame is complete only with its mask message (an empty one says "no detection").
+        image_depth: option ``camera.image_depth``.
 
     Attributes:
-        camera: the calibration in force, None before the first one.
         dropped_total: images that were replaced, lost by the middleware, or refused.
     """
 
-    def __init__(self, live: bool, with_masks: bool) -> None:
+    def __init__(self, live: bool, with_masks: bool, image_depth: str = "auto") -> None:
         self._live = live
         self._images: deque[tuple[int, Any]] = deque()
         self._with_masks = with_masks
         self._masks: dict[int, Any] = {}
         self._last_number: dict[str, int] = {}
-        self.camera: Camera | None = None
+        self._image_depth = image_depth
+        self._decoder: FrameDecoder | None = None
         self.dropped_total = 0
 
     def __len__(self) -> int:
         """Images that wait."""
         return len(self._images)
+
+    @property
+    def is_calibrated(self) -> bool:
+        """There is a calibration."""
+        return self._decoder is not None
 
     def add_image(self, topic: str, message: Any, number: int | None) -> None:
         """Queue an image.
@@ -62,18 +69,18 @@ class Entrance:
         while len(self._masks) > _MASKS_KEPT:
             del self._masks[min(self._masks)]
 
-    def set_camera(self, camera: Camera) -> bool:
-        """Take over a calibration; whether it replaces a different one.
+    def set_calibration(self, calibration: Calibration) -> bool:
+        """Take over a calibration; whether it replaces a different one. One that agrees changes nothing.
 
         Raises:
             FrameError: it does, in a replay: a run has one calibration.
         """
-        if messages.same_camera(camera, self.camera):
+        if self._decoder is not None and self._decoder.calibration.is_same(calibration):
             return False
-        replaces = self.camera is not None
+        replaces = self._decoder is not None
         if replaces and not self._live:
             raise FrameError("camera_info changes during the run: split the recording, or start a new run")
-        self.camera = camera
+        self._decoder = FrameDecoder(calibration, self._image_depth)
         return replaces
 
     def next_frame(self, admission: Admission) -> tuple[Frame, str] | None:
@@ -82,15 +89,15 @@ class Entrance:
         Raises:
             FrameError: the next image may not enter: its stamp, encoding or size. It is gone and counted.
         """
-        if not self._images or self.camera is None:
+        if not self._images or self._decoder is None:
             return None
         stamp_ns, message = self._images[0]
         try:
             admission.check(stamp_ns)
             if self._with_masks and stamp_ns not in self._masks:
                 return None
-            mask = decode_mask(self._masks.pop(stamp_ns)) if self._with_masks else None
-            frame = Frame(stamp_ns, decode_image(message), self.camera, mask)
+            mask = self._masks.pop(stamp_ns) if self._with_masks else None
+            frame = self._decoder.frame(stamp_ns, message, mask)
         except FrameError as error:
             self._images.popleft()
             self.dropped_total += 1

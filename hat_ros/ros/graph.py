@@ -100,7 +100,7 @@ def replay(
         raise ConfigError(f"graph must be 'processes' or 'single', found '{graph}'")
     if credits is not None:
         config = replace(config, graph=replace(config.graph, credits_replay=credits))
-    reader = BagReader(bag, image_topic=image_topic, camera_info_topic=camera_info_topic)
+    reader = BagReader(bag, image_topic=image_topic, camera_info_topic=camera_info_topic, camera_config=config.camera)
     prepare_environment()
     keep_large_blocks()
     with contextlib.ExitStack() as stack:

@@ -37,6 +37,7 @@ class PlayerSession(Session):
             extra["bag"],
             image_topic=extra["image_topic"] or None,
             camera_info_topic=extra["camera_info_topic"] or None,
+            camera_config=settings.config.camera,
         )
         choice = {name: extra[name] for name in ("rate", "first_frame", "max_frames")}
         self.playback = Playback(self._bag, self._config, live=settings.live, **choice)
@@ -110,7 +111,9 @@ class PlayerSession(Session):
 
     def _send(self, packet: Packet) -> None:
         if self.playback.sent == 1:
-            camera_info = self._wire.camera_info(packet.stamp_ns, self._bag.frame_id, self._bag.camera)
+            camera_info = self._wire.camera_info(
+                packet.stamp_ns, self._bag.frame_id, self._bag.camera, self._bag.calibration.lens
+            )
             self._camera_info.publish(camera_info)
         if self._mask is not None:
             empty = np.zeros((0, 0), dtype=np.uint8)

@@ -10,6 +10,7 @@ from std_srvs.srv import Trigger
 
 from hat_ros.errors import FrameError
 from hat_ros.io import messages, topics
+from hat_ros.io.calibration import calibration_from
 from hat_ros.ros import qos
 from hat_ros.ros.diagnostics import OK, STEADY, WARN
 from hat_ros.ros.entrance import Entrance
@@ -33,7 +34,9 @@ class SegmentationSession(Session):
         self._node, self._wire, self._diagnostics = node, node.wire, node.diagnostics
         self._stage = SegmentationStage(config, node.settings.load_target())
         self._priors = PriorBuffer(config.prior)
-        self._entrance = Entrance(live, annotated)
+        self._entrance = Entrance(live, annotated, config.camera.image_depth)
+        self._rectified = config.camera.rectified
+        self._image_topic = node.resolve_topic_name(topics.IMAGE)
         self._in_flight = FramesInFlight(config.graph, live)
         self._epoch = 0
         self._camera_sent = self._is_open = False
@@ -82,7 +85,11 @@ class SegmentationSession(Session):
         self._pump()
 
     def _on_camera_info(self, message: Any) -> None:
-        if self._entrance.set_camera(messages.camera_from(message)):
+        calibration = calibration_from(message, self._image_topic, self._rectified)
+        if calibration is None:
+            self._diagnostics.report(WARN, f"{topics.CAMERA_INFO} says that the camera is not calibrated: K is zero")
+            return
+        if self._entrance.set_calibration(calibration):
             self._camera_sent = False
             self._new_epoch()
         self._pump()
@@ -137,7 +144,7 @@ class SegmentationSession(Session):
             self._new_epoch()
             self._is_open = False
             self._node.fail(overdue)
-        elif self._is_open and len(self._entrance) and self._entrance.camera is None:
+        elif self._is_open and len(self._entrance) and not self._entrance.is_calibrated:
             self._diagnostics.report(WARN, f"images arrive, but no calibration on {topics.CAMERA_INFO}")
         self._pump()
 

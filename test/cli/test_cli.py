@@ -235,7 +235,7 @@ def test_recording_without_a_usable_frame_is_a_failed_run(scripted, settings, tm
             writer.write_frame(stamp(i), b"\xff\xd8 no picture", CAMERA)
         writer.write_target(model)
     assert main(["track", str(tmp_path / "bad"), "--out", str(tmp_path / "out"), "--config", settings]) == 1
-    assert "3 were rejected" in capsys.readouterr().err
+    assert "3 were refused" in capsys.readouterr().err
 
 
 def test_doctor_knows_this_machine(capsys):

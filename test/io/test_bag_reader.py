@@ -121,7 +121,7 @@ def test_unusable_calibration_is_named(tmp_path):
             (lambda m: m.k.__setitem__(0, np.nan), "finite"),
             (lambda m: m.k.__setitem__(0, -1.0), "fx, fy > 0"),
             (lambda m: setattr(m, "width", 0), "image size"),
-            (lambda m: m.d.__setitem__(0, 0.5), "rectify first"),
+            (lambda m: m.d.__setitem__(0, np.inf), "camera_info.d must be finite"),
         ]
     ):
         message = WIRE.camera_info(stamp(0), "c", CAMERA)
@@ -149,7 +149,7 @@ def test_malformed_frames_are_named_by_their_stamp(tmp_path):
         writer.write_message(topics.IMAGE, WIRE.image(stamp(1), "c", "rgb8", image(1)[:20]), stamp(1))
     frames = BagReader(tmp_path / "bag").frames()
     next(frames)
-    with pytest.raises(FrameError, match=f"frame {stamp(1)}: image must be uint8"):
+    with pytest.raises(FrameError, match=f"frame {stamp(1)}: image is 40x20 px but camera_info is for 40x30 px"):
         next(frames)
 
 

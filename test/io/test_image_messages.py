@@ -43,10 +43,12 @@ def test_frame_with_another_encoding_or_alpha_is_rejected():
 def test_camera_info_round_trips_and_refuses_what_a_pinhole_is_not():
     camera = Camera(np.array([[500.5, 0.25, 160.1], [0, 501.5, 120.2], [0, 0, 1.0]]), 320, 240)
     for make, carry in ((ROS, through_dds), (BAG, through_bag)):
-        assert messages.same_camera(messages.camera_from(carry(make.camera_info(STAMP, "cam", camera))), camera)
+        found = messages.camera_from(carry(make.camera_info(STAMP, "cam", camera)))
+        assert np.array_equal(found.K, camera.K)
+        assert (found.width, found.height) == (camera.width, camera.height)
     message = ROS.camera_info(STAMP, "cam", camera)
     message.d = [0.1, 0.0, 0.0, 0.0, 0.0]
-    with pytest.raises(FrameError, match="rectify first"):
+    with pytest.raises(FrameError, match=r"camera_info\.d must be zero"):
         messages.camera_from(message)
     message = ROS.camera_info(STAMP, "cam", camera)
     message.binning_x = 2

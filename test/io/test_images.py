@@ -32,19 +32,19 @@ def message(encoding, pixels):
     ],
 )
 def test_colour_encodings_agree(encoding, pixels):
-    assert np.array_equal(images.decode_image(message(encoding, pixels)), picture())
+    assert np.array_equal(images.decode_image(message(encoding, pixels))[0], picture())
 
 
 def test_grey_encodings_agree():
     grey = picture()[..., 0]
     expected = np.dstack([grey] * 3)
-    assert np.array_equal(images.decode_image(message("mono8", grey)), expected)
+    assert np.array_equal(images.decode_image(message("mono8", grey))[0], expected)
     wide = np.stack([np.full_like(grey, 77), grey], axis=-1)  # little-endian 16 bit: low byte first
     sixteen = message("mono16", wide)
-    assert np.array_equal(images.decode_image(sixteen), expected)
+    assert np.array_equal(images.decode_image(sixteen)[0], expected)
     swapped = message("mono16", wide[..., ::-1])
     swapped.is_bigendian = 1
-    assert np.array_equal(images.decode_image(swapped), expected)
+    assert np.array_equal(images.decode_image(swapped)[0], expected)
 
 
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
@@ -52,8 +52,90 @@ def test_bayer_patterns_reconstruct_flat_colours(pattern):
     rgb = {"r": 200, "g": 120, "b": 40}
     tile = np.array([[rgb[pattern[0]], rgb[pattern[1]]], [rgb[pattern[2]], rgb[pattern[3]]]], dtype=np.uint8)
     mosaic = np.tile(tile, (8, 8))
-    found = images.decode_image(message(f"bayer_{pattern}8", mosaic))
+    found = images.decode_image(message(f"bayer_{pattern}8", mosaic))[0]
     assert found[8, 8].tolist() == [200, 120, 40]
+
+
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+def test_wide_encodings_are_the_narrow_ones_in_more_bits(pattern, bits):
+    # The brightest value is in the picture, so that the depth can be found; the low bits are noise.
+    rgb = picture()
+    rgb[0, 0] = 255
+    alpha = np.full((*rgb.shape[:2], 1), 200, np.uint8)
+    rgba = np.concatenate([rgb, alpha], axis=-1)
+    same = {
+        "mono": rgb[..., :1],
+        "rgb": rgb,
+        "bgr": rgb[..., ::-1],
+        "rgba": rgba,
+        "bgra": rgba[..., [2, 1, 0, 3]],
+        f"bayer_{pattern}": rgb[..., :1],
+    }
+    noise = np.random.default_rng(0)
+    for name, pixels in same.items():
+        expected = images.decode_image(message(f"{name}8", pixels))[0]
+        wide = pixels.astype(np.uint16) << (bits - 8)
+        wide += noise.integers(0, 1 << (bits - 8), wide.shape, dtype=np.uint16)
+        for order, big in (("<u2", 0), (">u2", 1)):
+            m = message(
+                f"{name}16", np.ascontiguousarray(wide).astype(order).view(np.uint8).reshape(*wide.shape[:2], -1)
+            )
+            m.is_bigendian = big
+            found, known = images.decode_image(m)
+            assert known.bits == bits, name
+            assert np.array_equal(found, expected), name
+
+
+def yuv_of(rgb, full):
+    """(H, W, 3) float Y, U, V as the recommendation BT.601 defines them."""
+    red, green, blue = np.moveaxis(rgb.astype(float), -1, 0)
+    luma = 0.299 * red + 0.587 * green + 0.114 * blue
+    colours = [(blue - luma) / 1.772, (red - luma) / 1.402]
+    if full:
+        return np.stack([luma, *(128 + c for c in colours)], axis=-1)
+    return np.stack([16 + luma * 219 / 255, *(128 + c * 224 / 255 for c in colours)], axis=-1)
+
+
+def blocks():
+    """A picture whose blocks of 2 x 2 pixels have one colour, with black and white."""
+    rgb = np.random.default_rng(1).integers(0, 256, (10, 12, 3), dtype=np.uint8)
+    rgb[:3], rgb[3] = 0, 255
+    return rgb.repeat(2, axis=0).repeat(2, axis=1)
+
+
+def packed_yuv(encoding, yuv):
+    luma_first = encoding in ("yuyv", "yuv422_yuy2")
+    colour = np.where(np.arange(yuv.shape[1]) % 2, yuv[..., 2], yuv[..., 1])
+    return np.dstack([yuv[..., 0], colour] if luma_first else [colour, yuv[..., 0]])
+
+
+def planar_yuv(encoding, yuv):
+    step = 1 if encoding == "nv24" else 2
+    pairs = yuv[::step, ::step, 1:]
+    return np.concatenate([yuv[..., 0].ravel(), (pairs[..., ::-1] if encoding == "nv21" else pairs).ravel()])
+
+
+@pytest.mark.parametrize("full", [False, True])
+@pytest.mark.parametrize("encoding", ["yuv422", "uyvy", "yuv422_yuy2", "yuyv", "nv12", "nv21", "nv24"])
+def test_yuv_of_either_range_gives_the_colours_back(encoding, full):
+    yuv = np.rint(yuv_of(blocks(), full)).clip(0, 255).astype(np.uint8)
+    if encoding.startswith("nv"):
+        m = message(encoding, yuv[..., 0])
+        m.data = planar_yuv(encoding, yuv)
+    else:
+        m = message(encoding, packed_yuv(encoding, yuv))
+    found, known = images.decode_image(m)
+    assert known.full_luma is full
+    assert np.abs(found.astype(int) - blocks()).max() <= 3
+
+
+@pytest.mark.parametrize(
+    ("encoding", "shape"), [("yuyv", (4, 5, 2)), ("nv12", (4, 6)), ("nv21", (5, 6)), ("nv24", (4, 6))]
+)
+def test_yuv_of_a_size_that_does_not_fit_is_refused(encoding, shape):
+    with pytest.raises(FrameError, match=r"even width|in whole rows"):
+        images.decode_image(message(encoding, np.zeros(shape, np.uint8)))
 
 
 def test_row_padding_is_left_out():
@@ -61,18 +143,48 @@ def test_row_padding_is_left_out():
     padded[:, :30] = picture()
     m = message("rgb8", padded)
     m.width = 30
-    assert np.array_equal(images.decode_image(m), picture())
+    assert np.array_equal(images.decode_image(m)[0], picture())
 
 
 @pytest.mark.parametrize("extension", [".png", ".jpg"])
 def test_compressed_images_decode(extension):
     data = cv2.imencode(extension, picture()[..., ::-1])[1].tobytes()
-    found = images.decode_image(WIRE.compressed(10**9, "cam", extension[1:], data))
+    found = images.decode_image(WIRE.compressed(10**9, "cam", extension[1:], data))[0]
     assert found.shape == (20, 30, 3)
     if extension == ".png":
         assert np.array_equal(found, picture())
     else:
         assert np.abs(found.astype(int) - picture()).mean() < 6
+
+
+@pytest.mark.parametrize("extension", [".png", ".tiff"])
+@pytest.mark.parametrize("bits", [10, 12, 16])
+def test_compressed_images_of_16_bits_are_read_by_their_depth(extension, bits):
+    rgb = picture()
+    rgb[0, 0] = 255
+    data = cv2.imencode(extension, rgb[..., ::-1].astype(np.uint16) << (bits - 8))[1].tobytes()
+    found, known = images.decode_image(WIRE.compressed(10**9, "cam", extension[1:], data))
+    assert known.bits == bits
+    assert np.array_equal(found, rgb)
+
+
+def test_webp_of_every_kind_and_tiff_decode():
+    lossy = cv2.imencode(".webp", picture()[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 95])[1].tobytes()
+    found = images.decode_image(WIRE.compressed(10**9, "cam", "webp", lossy))[0]
+    assert np.abs(found.astype(int) - picture()).mean() < 6
+    exact = cv2.imencode(".webp", picture()[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, 101])[1].tobytes()
+    with_alpha = np.dstack([picture()[..., ::-1], np.full((20, 30), 100, np.uint8)])
+    extended = cv2.imencode(".webp", with_alpha, [cv2.IMWRITE_WEBP_QUALITY, 101])[1].tobytes()
+    tiff = cv2.imencode(".tiff", picture()[..., ::-1])[1].tobytes()
+    for data in (exact, tiff):
+        assert np.array_equal(images.decode_image(WIRE.compressed(10**9, "cam", "x", data))[0], picture())
+    assert images.decode_image(WIRE.compressed(10**9, "cam", "x", extended))[0].shape == (20, 30, 3)
+
+
+def test_tiff_of_real_numbers_is_refused():
+    data = cv2.imencode(".tiff", picture().astype(np.float32))[1].tobytes()
+    with pytest.raises(FrameError, match="8 or 16 bits per value, found float32"):
+        images.decode_image(WIRE.compressed(10**9, "cam", "tiff", data))
 
 
 def with_size(data, width, height):
@@ -83,8 +195,8 @@ def with_size(data, width, height):
 @pytest.mark.parametrize(
     ("data", "complaint"),
     [
-        (b"", "neither JPEG nor PNG"),
-        (b"GIF89a" + bytes(100), "neither JPEG nor PNG"),
+        (b"", "neither JPEG, PNG, WebP nor TIFF"),
+        (b"GIF89a" + bytes(100), "neither JPEG, PNG, WebP nor TIFF"),
         (b"\x89PNG\r\n\x1a\n", "ends within its header"),
         (b"\xff\xd8\xff\xe0\x00\x10", "ends within its header"),
         (b"\xff\xd8\x00\x00", "damaged JPEG"),
@@ -99,14 +211,14 @@ def test_damaged_or_exploding_images_are_refused(data, complaint):
 
 def test_every_truncation_and_bit_flip_ends_in_a_picture_or_a_frame_error():
     rng = np.random.default_rng(0)
-    for extension in (".png", ".jpg"):
+    for extension in (".png", ".jpg", ".webp", ".tiff"):
         data = cv2.imencode(extension, picture()[..., ::-1])[1].tobytes()
         for _ in range(60):
             bad = bytearray(data[: rng.integers(1, len(data))] if rng.random() < 0.4 else data)
             for at in rng.integers(0, len(bad), 3):
                 bad[at] ^= 1 << rng.integers(8)
             try:
-                found = images.decode_image(WIRE.compressed(10**9, "cam", "x", bytes(bad)))
+                found = images.decode_image(WIRE.compressed(10**9, "cam", "x", bytes(bad)))[0]
             except FrameError:
                 continue
             assert found.dtype == np.uint8

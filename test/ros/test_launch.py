@@ -10,6 +10,7 @@ from types import ModuleType
 import pytest
 
 import hat_ros
+from hat_ros.config import flat_options
 from hat_ros.ros.params import _RUN_OPTIONS
 
 LAUNCH_FILE = Path(__file__).parents[2] / "launch" / "hat.launch.py"
@@ -60,7 +61,7 @@ def test_every_argument_is_used_and_every_parameter_exists(described):
     used = {"overlay"}
     for node in of_class(described, "Node"):
         (parameters,) = node.options["parameters"]
-        assert set(parameters) <= set(_RUN_OPTIONS)
+        assert set(parameters) <= {*_RUN_OPTIONS, *flat_options()}
         used |= {value.args[0] for value in parameters.values()}
     for _, target in of_class(described, "Node")[0].options["remappings"]:
         parts = target if isinstance(target, list) else [target]

@@ -36,7 +36,7 @@ def test_the_overlay_is_drawn_while_it_is_watched_and_images_come_only_then(exec
     spin_until(executor, lambda: False, turns=20)
     send[topics.STATUS].publish(make.status("c", estimate, messages.Admitted(0, 0, 0)))
     assert spin_until(executor, lambda: seen)
-    drawn = images.decode_image(seen[0])
+    drawn = images.decode_image(seen[0])[0]
     assert drawn.shape == (48, 64, 3)
     assert drawn.max() > 100
     assert seen[0].header.frame_id == "c"

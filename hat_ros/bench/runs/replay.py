@@ -65,7 +65,7 @@ def replay_bag(path: Path, out: Path, config: HatConfig, options: ReplayOptions,
         ) from None
     folder = ResultFolder(out, options.overwrite)
     spec = SourceSpec(path)
-    source = spec.open()
+    source = spec.open(config.camera)
     if not isinstance(source.recording, BagReader):
         raise UsageError(f"{path} is no bag: `hat import sequence {path} --out BAG` makes one, `hat track` needs none")
     target = source.recording.target_path

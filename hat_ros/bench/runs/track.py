@@ -66,7 +66,7 @@ def track(spec: SourceSpec, out: Path, config: HatConfig, options: TrackOptions,
     if options.credits is not None:
         config = replace(config, graph=replace(config.graph, credits_replay=options.credits))
     folder = ResultFolder(out, options.overwrite)
-    source = spec.open()
+    source = spec.open(config.camera)
     if source.count(options.start, options.limit) == 0:
         raise UsageError(f"{spec.path} has {source.count()} frames, --start {options.start} leaves none")
     masks_given = config.segmentation.backend in GIVEN_MASK_BACKENDS
@@ -117,7 +117,10 @@ def _run(
             bag.write_context(source.recording.camera, source.truth_rows())
         overlaps = silhouettes.overlaps(source.masks(options.start, options.limit))
     if not rows:
-        raise RunError(f"no frame of {source.path} could be used, {pipeline.rejected} were rejected (stamp or image)")
+        raise RunError(
+            f"no frame of {source.path} could be used, {pipeline.rejected} were refused, the first because: "
+            f"{pipeline.first_rejection}"
+        )
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     write_overlaps(folder, overlaps)
     speed, memory = latency_summary(rows, finish_s), {"peak_memory_mib": peak_mib} | memory_summary(rows)
