@@ -83,8 +83,9 @@ def _add_synth(commands: Commands) -> None:
     parser = commands.add_parser(
         "synth",
         help="a clip rendered from a CAD model, with exact ground truth",
-        description="Render a tumbling spacecraft in sunlight. WHAT is a CAD file in metres, a model of this package, "
-        "a named clip (its settings are fixed), `suite` (all clips of the synthetic benchmark), or `list`.",
+        description="Render a tumbling spacecraft in sunlight. WHAT is a CAD file in metres, a target.yaml, a model of "
+        "this package, a named clip (its settings are fixed), `suite` (all clips of the synthetic benchmark), or "
+        "`list`.",
         formatter_class=DefaultsFormatter,
     )
     parser.add_argument("what", metavar="WHAT", help="CAD file, model, clip, `suite` or `list`")

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from hat_ros.bench.source import SourceSpec
     from hat_ros.config import HatConfig
 
-FORMATS = ("sequence", "spark", "shirt", "swisscube", "bop", "ycbv")
+FORMATS = ("sequence", "spark", "shirt", "swisscube", "bop", "ycbv", "ycb_video", "speed")
 
 Commands = Any  # argparse's sub-parser action has no public name
 

@@ -21,6 +21,7 @@ from hat_ros.target.companions import say_once
 from hat_ros.target.mesh_file import read_scene, read_target_yaml
 from hat_ros.target.model import Surface, Target, area_vectors, triangle_areas
 from hat_ros.target.srgb import linear_from_srgb, srgb_from_linear
+from hat_ros.target.units import guess_unit_scale, warn_of_size
 
 MAX_TEXTURE_SIDE_PX = 2048
 MAX_SOURCE_TEXTURE_PX = 64 * 2**20
@@ -34,25 +35,55 @@ _FACE_SAMPLES = np.array(
 )
 
 
-def load_target(path: str | Path, unit_scale: float = 1.0) -> Target:
-    """Read a CAD model (obj, ply, stl, glb) or a ``target.yaml`` that names one.
+@dataclass(frozen=True)
+class ModelFile:
+    """A CAD file and what has to be known of it.
 
-    ``target.yaml`` holds ``mesh`` (file beside it), ``unit_scale`` (metres per file unit) and ``name``.
+    Attributes:
+        mesh: the file.
+        unit_scale: metres per unit of the file.
+        name: name of the target.
+    """
+
+    mesh: Path
+    unit_scale: float
+    name: str
+
+
+def find_model(path: str | Path, unit_scale: float | None = 1.0) -> ModelFile:
+    """The CAD file that a path names, itself or through a ``target.yaml``.
+
+    ``target.yaml`` holds ``mesh`` (file beside it), ``unit_scale`` (metres per file unit, or ``auto``) and ``name``.
 
     Args:
-        path: the file.
-        unit_scale: metres per unit of the file; multiplies the one of a ``target.yaml``.
+        path: obj, ply, stl, glb or a ``target.yaml``.
+        unit_scale: metres per unit of the file, multiplies the one of a ``target.yaml``; None = guessed from the size.
 
     Raises:
-        MeshError: unreadable, other format, empty, not finite, or of absurd size or extent.
+        MeshError: missing or malformed.
     """
     path = Path(path)
     if not path.is_file():
         raise MeshError(f"CAD model {path}: no such file")
+    stated, name = unit_scale, path.stem
     if path.suffix.lower() in (".yaml", ".yml"):
-        path, scale, name = read_target_yaml(path)
-        return target_from_scene(read_scene(path), name, unit_scale * scale)
-    return target_from_scene(read_scene(path), path.stem, unit_scale)
+        path, stated, name = read_target_yaml(path)
+        stated = None if stated is None or unit_scale is None else unit_scale * stated
+    return ModelFile(path, guess_unit_scale(read_scene(path), path) if stated is None else stated, name)
+
+
+def load_target(path: str | Path, unit_scale: float | None = 1.0) -> Target:
+    """Read a CAD model (obj, ply, stl, glb) or a ``target.yaml`` that names one.
+
+    Args:
+        path: see :func:`find_model`.
+        unit_scale: likewise.
+
+    Raises:
+        MeshError: unreadable, other format, empty, not finite, or of absurd size or extent.
+    """
+    model = find_model(path, unit_scale)
+    return target_from_scene(read_scene(model.mesh), model.name, model.unit_scale)
 
 
 def target_from_scene(scene: trimesh.Scene, name: str, unit_scale: float = 1.0) -> Target:
@@ -240,3 +271,4 @@ def _check_extent(corners: Float, name: str, unit_scale: float) -> None:
             f"CAD model {name}: its largest extent is {extent:.3g} m with unit_scale {unit_scale:g}, expected "
             f"{low:g} to {high:g} m; set unit_scale to the metres per unit of the file (0.001 for millimetres)"
         )
+    warn_of_size(extent, name, unit_scale)

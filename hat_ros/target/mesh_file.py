@@ -17,6 +17,7 @@ import yaml
 from hat_ros.errors import MeshError
 from hat_ros.target.companions import MATERIAL_SUFFIX, Companions, say_once
 from hat_ros.target.obj_text import material_libraries, plain_obj
+from hat_ros.target.units import AUTO
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb")
 MAX_FILE_BYTES = 256 * 2**20
@@ -25,8 +26,8 @@ MAX_VERTICES = 8_000_000
 MAX_NODES = 20_000
 
 
-def read_target_yaml(path: Path) -> tuple[Path, float, str]:
-    """Mesh file, metres per unit and name from a ``target.yaml``.
+def read_target_yaml(path: Path) -> tuple[Path, float | None, str]:
+    """Mesh file, metres per unit (None = to be guessed) and name from a ``target.yaml``.
 
     Raises:
         MeshError: malformed, or the mesh does not lie beside it.
@@ -41,14 +42,14 @@ def read_target_yaml(path: Path) -> tuple[Path, float, str]:
     if unknown:
         raise MeshError(f"{path}: unknown key '{unknown[0]}', known keys are mesh, unit_scale, name")
     scale = data.get("unit_scale", 1.0)
-    if isinstance(scale, bool) or not isinstance(scale, (int, float)):
-        raise MeshError(f"{path}: unit_scale must be a number, found {scale!r}")
+    if scale != AUTO and (isinstance(scale, bool) or not isinstance(scale, (int, float))):
+        raise MeshError(f"{path}: unit_scale must be a number or '{AUTO}', found {scale!r}")
     mesh = (path.parent / data["mesh"]).resolve()
     if path.parent.resolve() not in mesh.parents:
         raise MeshError(f"{path}: mesh '{data['mesh']}' must lie in the same folder")
     if mesh.suffix.lower() not in MESH_SUFFIXES:
         raise MeshError(f"{path}: mesh '{data['mesh']}' must be one of {', '.join(MESH_SUFFIXES)}")
-    return mesh, float(scale), str(data.get("name", mesh.stem))
+    return mesh, None if scale == AUTO else float(scale), str(data.get("name", mesh.stem))
 
 
 def read_scene(path: Path) -> trimesh.Scene:
@@ -67,7 +68,10 @@ def read_scene(path: Path) -> trimesh.Scene:
 
 def companions_of(path: Path) -> dict[str, Path]:
     """What a mesh names and has beside it: path relative to the mesh's folder -> file; errors of :func:`read_scene`."""
-    return _read(path)[1].found
+    marks = {".obj": b"mtllib", ".ply": b"TextureFile", ".glb": b'"uri"'}
+    # Large models are read once more only if they name anything.
+    is_named = path.suffix.lower() in marks and path.is_file() and marks[path.suffix.lower()] in path.read_bytes()
+    return _read(path)[1].found if is_named else {}
 
 
 def _read(path: Path) -> tuple[trimesh.Scene, Companions]:

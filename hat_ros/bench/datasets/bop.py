@@ -5,13 +5,14 @@
     ROOT/test/000048/scene_gt.json               {"1": [{"cam_R_m2c": [9], "cam_t_m2c": [3] mm, "obj_id"}]}
     ROOT/test/000048/scene_camera.json           {"1": {"cam_K": [9]}}
 
-Each object of a scene is a recording of its own. Image numbers become stamps, 0.1 s apart, gaps kept.
+Each object of a scene is a recording of its own, and so is each instance (``..._inst0``) where one object occurs
+several times. Image numbers become stamps, 0.1 s apart, gaps kept.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ import numpy as np
 
 from hat_ros.array_types import Float
 from hat_ros.bench.datasets.image_files import ImageFile, ImageRecording, camera_from_label, image_size, stamp_of
+from hat_ros.bench.datasets.instances import follow_instances
 from hat_ros.bench.datasets.sequence import read_json
 from hat_ros.errors import DatasetError
 from hat_ros.geometry import lie
@@ -43,7 +45,7 @@ def open_bop(
     Args:
         root: the data set's folder.
         model: unused here: the models come with the data set.
-        sequences: names ``SCENE`` or ``SCENE_objID`` to keep, empty = all.
+        sequences: names ``SCENE``, ``SCENE_objID`` or ``SCENE_objID_instN`` to keep, empty = all.
         targets_only: keep ground truth only at the published targets (``test_targets_bop19.json``).
         without: object ids that are left out.
 
@@ -62,14 +64,18 @@ def open_bop(
     for scene in scenes:
         gt, calibration = read_json(scene / "scene_gt.json"), read_json(scene / "scene_camera.json")
         for object_id in sorted(_objects(gt, scene) - set(without)):
-            name = f"{scene.name}_obj{object_id}"
-            if sequences and name not in sequences and scene.name not in sequences:
+            instances = _instances(gt, object_id, scene)
+            whole = f"{scene.name}_obj{object_id}"
+            names = [whole] if len(instances) == 1 else [f"{whole}_inst{index}" for index in range(len(instances))]
+            if sequences and not {scene.name, whole, *names} & set(sequences):
                 continue
             mesh = root / "models" / f"obj_{object_id:06d}.ply"
             if not mesh.is_file():
                 raise DatasetError(f"{mesh}: CAD model of object {object_id} in scene {scene.name} is missing")
-            recording = read_scene(scene, name, mesh, gt, calibration, object_id, listed)
-            yield replace(recording, scene=(int(scene.name), object_id) if scene.name.isdigit() else None)
+            for name, entries in zip(names, instances, strict=True):
+                if not sequences or {scene.name, whole, name} & set(sequences):
+                    recording = read_scene(scene, name, mesh, gt, calibration, object_id, listed, entries=entries)
+                    yield replace(recording, scene=(int(scene.name), object_id) if scene.name.isdigit() else None)
 
 
 def open_ycbv(root: Path, model: Path | None = None, sequences: Collection[str] = ()) -> Iterator[ImageRecording]:
@@ -91,16 +97,21 @@ def read_scene(
     object_id: int | None,
     targets: set[tuple[int, int, int]] | None = None,
     mesh_scale: float = MILLIMETRE,
+    entries: Mapping[int, int] | None = None,
 ) -> ImageRecording:
-    """One object of one scene; ``object_id`` None takes the first entry of every image."""
+    """One object of one scene; ``object_id`` None takes the first entry of every image.
+
+    ``entries``: image number -> index of the entry that counts, for one of several instances.
+    """
     files, cameras = [], []
     images = _images(scene)
     for number, image in sorted(images.items()):
-        entries = gt.get(str(number), []) if isinstance(gt, dict) else []
+        listed = gt.get(str(number), []) if isinstance(gt, dict) else []
         T_cam_target: Float | None = None
         masks: tuple[Path, ...] = ()
-        for index, entry in enumerate(entries):
-            if object_id is None or entry.get("obj_id") == object_id:
+        for index, entry in enumerate(listed):
+            is_asked = object_id is None or entry.get("obj_id") == object_id
+            if is_asked if entries is None else entries.get(number) == index:
                 T_cam_target = _pose(entry, f"{scene}/scene_gt.json, image {number}, entry {index}")
                 mask = scene / "mask_visib" / f"{number:06d}_{index:06d}.png"
                 masks = (mask,) if mask.is_file() else ()
@@ -132,6 +143,25 @@ def _objects(gt: Any, scene: Path) -> set[int]:
     except (AttributeError, KeyError, TypeError, ValueError):
         raise DatasetError(f"{scene}/scene_gt.json: expected image number -> list of entries with obj_id") from None
     return set(found)
+
+
+def _instances(gt: Any, object_id: int, scene: Path) -> list[dict[int, int]]:
+    """Per instance of an object: image number -> index of its entry."""
+    places: dict[int, dict[int, Float]] = {}
+    for number, entries in gt.items():
+        for index, entry in enumerate(entries):
+            if int(entry["obj_id"]) == object_id:
+                T = _pose(entry, f"{scene}/scene_gt.json, image {number}, entry {index}")
+                places.setdefault(_number(number, scene), {})[index] = T[:3, 3]
+    if all(len(found) == 1 for found in places.values()):
+        return [{number: next(iter(found)) for number, found in places.items()}]
+    return follow_instances(places, f"{scene}/scene_gt.json")
+
+
+def _number(text: str, scene: Path) -> int:
+    if not text.isdigit():
+        raise DatasetError(f"{scene}/scene_gt.json: images are called by their number, found '{text}'")
+    return int(text)
 
 
 def _pose(entry: Any, where: str) -> Float:

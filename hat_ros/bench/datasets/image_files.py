@@ -56,6 +56,7 @@ class ImageRecording:
         unit_scale: metres per unit of the CAD file.
         detections: masks and boxes computed elsewhere, on the images as stored; where given, the files' own masks and
             boxes do not count.
+        mask_value: grey level of the target in the files' masks; None = all above 127.
         scene: (scene, object) numbers of a BOP data set, by which detections of many are told apart.
     """
 
@@ -67,6 +68,7 @@ class ImageRecording:
     unit_scale: float = 1.0
     detections: DetectionLookup | None = None
     scene: tuple[int, int] | None = None
+    mask_value: int | None = None
 
     def __len__(self) -> int:
         return len(self.files)
@@ -93,7 +95,8 @@ class ImageRecording:
         if item.masks:
             inside = np.zeros((self.camera.height, self.camera.width), bool)
             for path in item.masks:
-                inside |= self._rectify(_read(path, cv2.IMREAD_GRAYSCALE), path, cv2.INTER_NEAREST) > 127
+                levels = self._rectify(_read(path, cv2.IMREAD_GRAYSCALE), path, cv2.INTER_NEAREST)
+                inside |= levels > 127 if self.mask_value is None else levels == self.mask_value
             return inside.astype(np.uint8) * np.uint8(255)
         if item.box_xyxy is not None:
             mask = np.zeros((self.camera.height, self.camera.width), np.uint8)

@@ -20,7 +20,7 @@ from hat_ros.bench.datasets.image_files import ImageFile, ImageRecording
 from hat_ros.errors import DatasetError, UsageError
 from hat_ros.io.bag_writer import BagWriter
 from hat_ros.io.provenance import input_hash
-from hat_ros.target.loading import load_target
+from hat_ros.target.loading import find_model, load_target
 from hat_ros.target.mesh_file import companions_of
 from hat_ros.target.rendering import create_renderer
 
@@ -36,6 +36,8 @@ FORMATS = {
     "swisscube": "hat_ros.bench.datasets.swisscube:open_swisscube",
     "bop": "hat_ros.bench.datasets.bop:open_bop",
     "ycbv": "hat_ros.bench.datasets.bop:open_ycbv",
+    "ycb_video": "hat_ros.bench.datasets.ycb_video:open_ycb_video",
+    "speed": "hat_ros.bench.datasets.speed:open_speed",
 }
 
 Progress = Callable[[str, int, int], None]
@@ -136,11 +138,12 @@ def import_dataset(
 
 def _made_from(fmt: str, recording: ImageRecording, boxes: bool, detections: Path | None) -> dict[str, Any]:
     """What decides a bag's content beside the data set's own images and labels."""
-    companions = companions_of(recording.target_path)
+    mesh = find_model(recording.target_path).mesh
+    companions = companions_of(mesh)
     return {
         "format": fmt,
         "sequence": recording.name,
-        "model_sha256": input_hash(recording.target_path),
+        "model_sha256": input_hash(mesh),
         **({"companions_sha256": {name: input_hash(path) for name, path in companions.items()}} if companions else {}),
         "boxes_from_labels": boxes,
         "detections": None if detections is None else detections.name,
@@ -187,7 +190,8 @@ def _write_bag(recording: ImageRecording, bag: Path, made_from: dict[str, Any], 
             )
             if progress is not None:
                 progress(recording.name, index + 1, len(recording))
-        writer.write_target(recording.target_path, recording.unit_scale, recording.name)
+        model = find_model(recording.target_path, recording.unit_scale)
+        writer.write_target(model.mesh, model.unit_scale, recording.name)
         text = json.dumps(made_from, indent=2) + "\n"
         (partial / bag.name / IMPORT_FILE).write_text(text, encoding="utf-8")
     if bag.exists():  # made from something else

@@ -23,6 +23,8 @@ from hat_ros.array_types import Float
 from hat_ros.bench.datasets.image_files import ImageFile, ImageRecording, pose_from_label, stamp_of
 from hat_ros.errors import DatasetError, FrameError
 from hat_ros.geometry import lie
+from hat_ros.target.loading import find_model
+from hat_ros.target.units import AUTO
 from hat_ros.types import Camera
 
 
@@ -42,14 +44,18 @@ def load_sequence(folder: str | Path) -> ImageRecording:
     if not mesh.is_file():
         raise DatasetError(f"{labels_path}: the CAD model 'mesh' names {mesh.name!r}, which is not in the folder")
     scale = labels.get("scale", 1.0)
+    if scale == AUTO:
+        scale = find_model(mesh, None).unit_scale
     if isinstance(scale, bool) or not isinstance(scale, (int, float)):
-        raise DatasetError(f"{labels_path}: 'scale' must be a number, found {scale!r}")
+        raise DatasetError(f"{labels_path}: 'scale' must be a number or '{AUTO}', found {scale!r}")
     files = [_file(folder, labels_path, entry, index) for index, entry in enumerate(labels["frames"])]
     return ImageRecording(folder.name, camera, mesh, files, unit_scale=float(scale))
 
 
-def write_labels(folder: Path, camera: Camera, mesh: str, kind: str, poses: Float, names: list[str]) -> None:
-    """Write ``labels.json``: (N, 4, 4) ``T_cam_target`` poses of the named images."""
+def write_labels(
+    folder: Path, camera: Camera, mesh: str, kind: str, poses: Float, names: list[str], unit_scale: float = 1.0
+) -> None:
+    """Write ``labels.json``: (N, 4, 4) ``T_cam_target`` poses of the named images, metres per unit of the CAD file."""
     frames = [
         {
             "file": name,
@@ -62,7 +68,7 @@ def write_labels(folder: Path, camera: Camera, mesh: str, kind: str, poses: Floa
         "K": camera.K.tolist(),
         "size": [camera.width, camera.height],
         "mesh": mesh,
-        "scale": 1.0,
+        "scale": unit_scale,
         "kind": kind,
         "frames": frames,
     }

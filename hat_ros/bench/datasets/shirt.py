@@ -43,7 +43,7 @@ def open_shirt(root: Path, model: Path | None = None, sequences: Collection[str]
         raise DatasetError(f"{camera_path}: expected cameraMatrix, distCoeffs, Nu and Nv")
     size = (calibration.get("Nu"), calibration.get("Nv"))
     camera = camera_from_label(calibration["cameraMatrix"], size, str(camera_path))
-    distortion = _distortion(calibration.get("distCoeffs", []), camera_path)
+    distortion = opencv_distortion(calibration.get("distCoeffs", []), camera_path)
     found = False
     for trajectory in TRAJECTORIES:
         for domain in DOMAINS:
@@ -57,7 +57,12 @@ def open_shirt(root: Path, model: Path | None = None, sequences: Collection[str]
         raise DatasetError(f"{root}: no folder like roe1/synthetic; give the folder that holds camera.json and roe1")
 
 
-def _distortion(values: Any, path: Path) -> Float:
+def opencv_distortion(values: Any, path: Path) -> Float:
+    """Coefficients from ``camera.json``, in OpenCV's order.
+
+    Raises:
+        DatasetError: not 4, 5, 8, 12 or 14 numbers.
+    """
     try:
         coefficients = np.array(values, dtype=np.float64).reshape(-1)
     except (TypeError, ValueError):

@@ -17,6 +17,8 @@ from hat_ros.bench.synth.backdrop import Earth, EarthView, Table, stars
 from hat_ros.bench.synth.sunlit import Light, SunlitRenderer
 from hat_ros.errors import UsageError
 from hat_ros.geometry import lie
+from hat_ros.target.companions import copy_with_companions
+from hat_ros.target.mesh_file import companions_of
 from hat_ros.target.model import Target
 from hat_ros.target.srgb import srgb_from_linear
 from hat_ros.types import Camera
@@ -216,16 +218,18 @@ def write_clip(
     spec: ClipSpec,
     poses: Float | None = None,
     progress: Progress | None = None,
+    unit_scale: float = 1.0,
 ) -> Path:
     """Render a clip into a ``sequence`` folder; it appears under its name only when it is complete.
 
     Args:
         seen: what the camera sees.
-        model: CAD file that goes with the clip, in metres; copied.
+        model: CAD file that goes with the clip; copied, with what it names.
         out: folder to create.
         spec: the clip.
         poses: see :func:`render_clip`.
         progress: called with (frames done, frames in all).
+        unit_scale: metres per unit of ``model``.
 
     Raises:
         UsageError: ``out`` exists already.
@@ -247,7 +251,7 @@ def write_clip(
         if progress is not None:
             progress(index + 1, spec.frames)
     mesh = f"target{model.suffix}"
-    shutil.copyfile(model, partial / mesh)
-    write_labels(partial, spec.camera, mesh, spec.kind, np.array(truth), names)
+    copy_with_companions(model, companions_of(model), partial, mesh)
+    write_labels(partial, spec.camera, mesh, spec.kind, np.array(truth), names, unit_scale)
     partial.rename(out)
     return out

@@ -16,7 +16,7 @@ from hat_ros.bench.synth.clips import ClipSpec, trajectory, write_clip
 from hat_ros.bench.synth.mismatch import Mismatch, apply_mismatch
 from hat_ros.bench.synth.models import write_model
 from hat_ros.errors import UsageError
-from hat_ros.target.loading import load_target
+from hat_ros.target.loading import find_model, load_target
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Clip:
     """A clip by name.
 
     Attributes:
-        model: own model's name, or a CAD file.
+        model: own model's name, a CAD file, or a ``target.yaml`` that names one.
         spec: how it is filmed.
         asymmetry: of an own model, see ``models.build_model``.
         mismatch: how the spacecraft differs from its CAD file.
@@ -129,11 +129,13 @@ def synthesize(clip: Clip, out: str | Path, as_bag: bool = True, progress: Progr
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     try:
-        model = _model_file(clip, work)
-        target = load_target(model)
+        model = find_model(_model_file(clip, work))
+        target = load_target(model.mesh, model.unit_scale)
         seen = apply_mismatch(target, clip.mismatch)
         report = None if progress is None else lambda done, total: progress(out.name, done, total)
-        folder = write_clip(seen, model, work / out.name, clip.spec, trajectory(clip.spec, target), report)
+        folder = write_clip(
+            seen, model.mesh, work / out.name, clip.spec, trajectory(clip.spec, target), report, model.unit_scale
+        )
         if as_bag:
             import_dataset("sequence", folder, out)
         else:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import scipy.io
 import trimesh
 
 from hat_ros.bench.datasets import spark
@@ -663,3 +664,170 @@ def test_an_imported_bag_has_the_textures_of_its_model_in_the_manifest(bop_root,
     cv2.imwrite(str(models / "maps" / "tex.png"), np.full((4, 4, 3), (200, 40, 20), np.uint8))
     import_dataset("bop", bop_root, tmp_path / "bags", sequences=["000048_obj2"])
     assert (load_target(bag / "target.yaml").face_rgb == (20, 40, 200)).all()
+
+
+# ---------------------------------------------------------------- several instances of one object
+
+
+def test_a_bop_scene_with_two_instances_becomes_two_recordings(tmp_path):
+    root = tmp_path / "bop"
+    scene = root / "test" / "000001"
+    write_scene(scene, object_ids=(1, 1))
+    save_mesh(root / "models" / "obj_000001.ply", (100, 60, 30))
+    gt = json.loads((scene / "scene_gt.json").read_text())
+    gt["1"].reverse()
+    for slot in (0, 1):
+        (scene / "mask_visib" / f"000001_{slot:06d}.png").rename(scene / f"{slot}.png")
+    for slot in (0, 1):
+        (scene / f"{slot}.png").rename(scene / "mask_visib" / f"000001_{1 - slot:06d}.png")
+    for entries, far in zip(gt.values(), (1, 0, 1), strict=True):  # 5 m apart, so that they can be told apart
+        entries[far]["cam_t_m2c"][0] += 5000
+    (scene / "scene_gt.json").write_text(json.dumps(gt))
+    first, second = open_dataset("bop", root)
+    assert [first.name, second.name] == ["000001_obj1_inst0", "000001_obj1_inst1"]
+    for index, (near, far) in enumerate(zip(first.truth().values(), second.truth().values(), strict=True)):
+        np.testing.assert_allclose(near, POSES[index], atol=1e-6)
+        np.testing.assert_allclose(far[:3, 3] - near[:3, 3], [5.5, 0, 0], atol=1e-6)
+    assert [np.flatnonzero(first.given_mask(item)[:, 0])[0] for item in first.files] == [10, 10, 10]
+    assert [np.flatnonzero(second.given_mask(item)[:, 0])[0] for item in second.files] == [20, 20, 20]
+    assert [r.name for r in open_dataset("bop", root, sequences=["000001_obj1_inst1"])] == ["000001_obj1_inst1"]
+    assert len(list(open_dataset("bop", root, sequences=["000001_obj1"]))) == 2
+
+
+# ---------------------------------------------------------------- SPEED, SPEED+
+
+
+def write_speed(root, domain, name, labels, truth=True):
+    folder = root / domain
+    entries = []
+    for index in labels:
+        save(folder / "images" / f"img{index:06d}.jpg", image(index))
+        T = POSES[index]
+        pose = {"q_vbs2tango_true": wxyz(T), "r_Vo2To_vbs_true": T[:3, 3].tolist()}
+        entries.append({"filename": f"img{index:06d}.jpg", **(pose if truth else {})})
+    (folder / f"{name}.json").write_text(json.dumps(entries))
+
+
+@pytest.fixture
+def speed_root(tmp_path):
+    root = tmp_path / "speedplus"
+    root.mkdir()
+    calibration = {"cameraMatrix": K.tolist(), "distCoeffs": [-0.2, 0.5, 0.0, 0.0, 0.0], "Nu": 160, "Nv": 120}
+    (root / "camera.json").write_text(json.dumps(calibration))
+    write_speed(root, "synthetic", "train", [0, 1])
+    write_speed(root, "synthetic", "validation", [2])
+    write_speed(root, "lightbox", "test", [0, 2])
+    return root
+
+
+def test_speed_lists_become_recordings(speed_root, tmp_path):
+    mesh = save_mesh(tmp_path / "tango.stl")
+    found = {r.name: r for r in open_dataset("speed", speed_root, mesh)}
+    assert sorted(found) == ["lightbox_test", "synthetic_train", "synthetic_validation"]
+    train = found["synthetic_train"]
+    np.testing.assert_allclose(list(train.truth().values()), POSES[:2], atol=1e-9)
+    assert (train.camera.width, train.camera.height) == (160, 120) and train.distortion[0] == -0.2
+    assert [r.name for r in open_dataset("speed", speed_root / "lightbox", mesh)] == ["test"]
+    bag = import_dataset("speed", speed_root, tmp_path / "out", model=mesh, sequences=["lightbox_test"])[0]
+    assert len(BagReader(bag).truth_rows()) == 2
+
+
+def test_speed_without_labels_or_with_a_part_of_the_images(speed_root, tmp_path, caplog):
+    mesh = save_mesh(tmp_path / "tango.stl")
+    write_speed(speed_root, "sunlamp", "test", [0, 1], truth=False)
+    (speed_root / "sunlamp" / "images" / "img000000.jpg").unlink()
+    (recording,) = open_dataset("speed", speed_root, mesh, ["sunlamp_test"])
+    assert recording.truth() == {} and [item.stamp_ns for item in recording.files] == [stamp_of(1)]
+    assert "1 of its 2 images are not there" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("camera", "says"),
+    [({"Nu": 160}, "expected cameraMatrix"), ({"cameraMatrix": [1], "Nu": 160, "Nv": 120}, "camera matrix 3x3")],
+)
+def test_bad_speed_camera(speed_root, tmp_path, camera, says):
+    (speed_root / "camera.json").write_text(json.dumps(camera))
+    with pytest.raises(DatasetError, match=says):
+        list(open_dataset("speed", speed_root, save_mesh(tmp_path / "tango.stl")))
+
+
+def test_old_speed_names_its_labels_and_its_camera_otherwise(tmp_path):
+    root, mesh = tmp_path / "speed", save_mesh(tmp_path / "tango.stl")
+    save(root / "images" / "train" / "img0.jpg", image(0))
+    camera = {"fx": 0.003, "fy": 0.0031, "ppx": 1e-5, "ppy": 1e-5, "Nu": 160, "Nv": 120}
+    (root / "camera.json").write_text(json.dumps(camera))
+    T = POSES[0]
+    labels = [{"filename": "img0.jpg", "q_vbs2tango": wxyz(T), "r_Vo2To_vbs_m": T[:3, 3].tolist()}]
+    (root / "train.json").write_text(json.dumps(labels))
+    (recording,) = open_dataset("speed", root, mesh)
+    np.testing.assert_allclose(recording.camera.K, [[300, 0, 79.5], [0, 310, 59.5], [0, 0, 1]])
+    np.testing.assert_allclose(recording.truth()[stamp_of(0)], T, atol=1e-9)
+
+
+def test_speed_needs_a_model_and_lists(speed_root, tmp_path):
+    with pytest.raises(DatasetError, match="--model"):
+        list(open_dataset("speed", speed_root))
+    with pytest.raises(DatasetError, match=r"train\.json"):
+        list(open_dataset("speed", tmp_path, save_mesh(tmp_path / "tango.stl")))
+
+
+# ---------------------------------------------------------------- YCB-Video as published
+
+
+def write_ycb_video(folder, frames=(0, 1, 2), classes=(2, 5), suffix="png"):
+    for frame in frames:
+        stem = f"{frame + 1:06d}"
+        save(folder / f"{stem}-color.{suffix}", image(frame))
+        label = np.zeros((120, 160), np.uint8)
+        poses = np.zeros((3, 4, len(classes)))
+        for slot, number in enumerate(classes):
+            label[10 + 20 * slot : 25 + 20 * slot, 30:50] = number
+            poses[:, :, slot] = POSES[frame][:3]
+            poses[0, 3, slot] += slot
+        save(folder / f"{stem}-label.png", label)
+        meta = {"cls_indexes": np.array(classes)[:, None], "poses": poses, "intrinsic_matrix": K, "factor_depth": 10000}
+        scipy.io.savemat(folder / f"{stem}-meta.mat", meta)
+
+
+@pytest.fixture
+def ycb_root(tmp_path):
+    root = tmp_path / "YCB_Video_Dataset"
+    write_ycb_video(root / "data" / "0048")
+    for number in range(1, 6):
+        save_mesh(root / "models" / f"{number + 1:03d}_thing" / "textured.obj", (0.1 * number, 0.06, 0.03))
+    return root
+
+
+def test_ycb_video_objects_become_recordings(ycb_root, tmp_path):
+    two, five = open_dataset("ycb_video", ycb_root)
+    assert [two.name, five.name] == ["0048_obj2", "0048_obj5"]
+    np.testing.assert_allclose(list(two.truth().values()), POSES, atol=1e-9)
+    assert list(two.truth()) == [stamp_of(number) for number in (1, 2, 3)]
+    np.testing.assert_allclose(five.truth()[stamp_of(2)][:3, 3] - POSES[1][:3, 3], [1, 0, 0], atol=1e-9)
+    for recording, top in ((two, 10), (five, 30)):
+        assert np.flatnonzero(recording.given_mask(recording.files[0])[:, 40]).tolist() == list(range(top, top + 15))
+        assert np.ptp(load_target(recording.target_path).vertices_m[:, 0]) == pytest.approx(0.2 if top == 10 else 0.5)
+    bag = import_dataset("ycb_video", ycb_root, tmp_path / "bags", sequences=["0048_obj5"])[0]
+    assert len(BagReader(bag).truth_rows()) == 3
+
+
+def test_ycb_video_bare_folder_of_frames(tmp_path):
+    write_ycb_video(tmp_path / "frames", classes=(7,), suffix="jpg")
+    (recording,) = open_dataset("ycb_video", tmp_path / "frames", save_mesh(tmp_path / "drill.ply"))
+    assert recording.name == "obj7" and len(recording.truth()) == 3
+    with pytest.raises(DatasetError, match=r"no folder 'models'.*object 7"):
+        list(open_dataset("ycb_video", tmp_path / "frames"))
+
+
+def test_bad_ycb_video(ycb_root, tmp_path):
+    frames = ycb_root / "data" / "0048"
+    with pytest.raises(DatasetError, match=r"--model is one CAD model.*2, 5"):
+        list(open_dataset("ycb_video", ycb_root, save_mesh(tmp_path / "m.ply")))
+    with pytest.raises(DatasetError, match=r"no frame like 000001-meta\.mat"):
+        list(open_dataset("ycb_video", tmp_path))
+    scipy.io.savemat(frames / "000002-meta.mat", {"cls_indexes": [[1]], "poses": np.eye(3)})
+    with pytest.raises(DatasetError, match=r"000002-meta\.mat: expected cls_indexes"):
+        list(open_dataset("ycb_video", ycb_root))
+    (frames / "000002-meta.mat").write_bytes(b"MATLAB 5.0 MAT-file" + bytes(200))
+    with pytest.raises(DatasetError, match="not a MATLAB file"):
+        list(open_dataset("ycb_video", ycb_root))

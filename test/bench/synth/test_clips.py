@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -265,3 +266,23 @@ def test_a_mismatched_clip_ships_the_nominal_model(tmp_path):
     with pytest.raises(UsageError, match="exists already"):
         synthesize(clip, tmp_path / "clip")
     assert not list(tmp_path.glob("*.work"))
+
+
+@pytest.mark.parametrize("as_bag", [True, False])
+@pytest.mark.parametrize("scale", ["0.001", "auto"])
+def test_a_target_yaml_in_millimetres_is_filmed_with_its_colours(tmp_path, as_bag, scale):
+    folder = tmp_path / "cad"
+    folder.mkdir()
+    (folder / "m.mtl").write_text("newmtl red\nKd 1 0 0\n")
+    box = trimesh.creation.box((2600, 1400, 900))
+    lines = [f"v {x} {y} {z}" for x, y, z in box.vertices] + [f"f {a} {b} {c}" for a, b, c in box.faces + 1]
+    (folder / "craft.obj").write_text("mtllib m.mtl\nusemtl red\n" + "\n".join(lines) + "\n")
+    (folder / "target.yaml").write_text(f"mesh: craft.obj\nunit_scale: {scale}\n")
+    out = synthesize(Clip(str(folder / "target.yaml"), SMALL), tmp_path / "out", as_bag)
+    if as_bag:
+        target = load_target(out / "target.yaml")
+    else:
+        recording = load_sequence(out)
+        target = load_target(recording.target_path, recording.unit_scale)
+    assert np.ptp(target.vertices_m, axis=0) == pytest.approx([2.6, 1.4, 0.9])
+    assert (target.face_rgb == (255, 0, 0)).all()
