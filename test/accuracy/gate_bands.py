@@ -11,13 +11,14 @@ import numpy as np
 from gate_clips import FRAMES, Recording
 
 from hat_ros.app.pipeline import Pipeline
-from hat_ros.bench.evaluation.metrics import UNTRUE_DEG, pose_errors
+from hat_ros.bench.evaluation.metrics import pose_errors
 from hat_ros.bench.methods.framewise import Hat
 from hat_ros.config import load_config
 from hat_ros.types import TrackState
 
 # A pose this good is right; one that is worse than the other must never be called TRACKING.
 RIGHT_E_P, FALSE_E_P = 0.05, 0.1
+UNTRUE_DEG = 30.0
 
 
 @dataclass(frozen=True)
