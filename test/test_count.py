@@ -74,3 +74,11 @@ def test_rooms_arrows_floors_and_circles():
     assert found == expected
     assert count.floors({item.room for item in modules}, found) == (3, 2)
     assert count.arrows(modules[:2], every) == {("core", "types")}, "arrows to what is not loaded do not count"
+
+
+def test_the_default_preset_loads_its_backends_and_no_others():
+    found = count.probe(count.HERE)
+    names = {Path(file).relative_to(count.HERE / "hat_ros").as_posix() for file in found["files"]}
+    assert {"tracker.py", "segmentation/classical.py", "hypotheses/template.py", "motion/feature.py"} <= names
+    assert not any(name.startswith(("nets/", "bench/", "ros/")) for name in names)
+    assert found["keys"].count("expert") > 0

@@ -33,7 +33,7 @@ LONG_FUNCTION, LONG_MODULE = 40, 300
 
 # Runs in the checkout that is counted, which may be an older one: only names that it always had are used.
 _PROBE = """
-import dataclasses, importlib, json, sys, tempfile
+import dataclasses, json, sys, tempfile
 from pathlib import Path
 import numpy as np, trimesh
 from hat_ros.config import load_config
@@ -49,12 +49,10 @@ def keys(section):
             yield field.metadata.get("level", "")
 
 config = load_config("default")
-for name in sys.argv[1:]:
-    try:
-        load_target = importlib.import_module(name).load_target
-        break
-    except ModuleNotFoundError:
-        continue
+try:
+    from hat_ros import load_target
+except ImportError:
+    from hat_ros.target import load_target
 with tempfile.TemporaryDirectory() as folder:
     trimesh.creation.box((1.0, 0.7, 0.4)).export(Path(folder) / "box.ply")
     tracker = HatTracker(config, load_target(Path(folder) / "box.ply"))
@@ -66,8 +64,6 @@ for index in range(6):
 loaded = [m.__file__ for name, m in sys.modules.items() if name.split(".")[0] == "hat_ros" and m.__file__]
 print(json.dumps({"files": loaded, "keys": list(keys(config))}))
 """
-# Where load_target lies, newest first.
-_TARGET_MODULES = ("hat_ros.target.loading", "hat_ros.target.model", "hat_ros.target")
 
 
 @dataclass(frozen=True)
@@ -244,7 +240,7 @@ def figures(modules: list[Module], every: dict[str, Module]) -> dict[str, int]:
 def probe(root: Path) -> dict[str, Any]:
     """Files that the default preset loads and the levels of all configuration keys."""
     environment = os.environ | {"PYTHONPATH": str(root)}
-    command = [sys.executable, "-c", _PROBE, *_TARGET_MODULES]
+    command = [sys.executable, "-c", _PROBE]
     done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         sys.exit(f"count: the default preset of {root} does not run:\n{done.stderr}")
