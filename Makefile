@@ -15,7 +15,7 @@ help:  ## this list
 demo: install  ## replay bags/demo through the five-node graph, print errors, write bag, overlay and report
 	$(BIN)/hat replay bags/demo --out out/demo --overwrite
 
-test: lint  ## lint and the whole suite, accuracy gate included; at most 12 minutes on two cores
+test: lint types  ## lint, types and the whole suite, accuracy gate included; at most 12 minutes on two cores
 	$(PYTEST) -m "not slow and not gpu"
 
 test-accuracy: install-test  ## the accuracy gate alone: the default preset on seeded clips

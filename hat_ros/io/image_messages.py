@@ -29,7 +29,7 @@ class ImageWire(MessageFamily):
             height=int(camera.height),
             width=int(camera.width),
             distortion_model="plumb_bob" if lens is None else lens.model,
-            d=self._numbers([0.0] * 5 if lens is None else lens.coefficients),
+            d=self._numbers([0.0] * 5 if lens is None else lens.coefficients.tolist()),
             k=K.ravel().copy(),
             r=np.eye(3).ravel(),
             p=np.column_stack([K, np.zeros(3)]).ravel(),
