@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hat_ros.cli.footage import FOOTAGE, add_footage, import_footage, refuse_footage_options
 from hat_ros.cli.options import FORMATS, Commands, DefaultsFormatter, natural, positive
 
 if TYPE_CHECKING:
@@ -21,13 +22,14 @@ def add_commands(commands: Commands) -> None:
 def _add_import(commands: Commands) -> None:
     parser = commands.add_parser(
         "import",
-        help="a data set in its own layout to bags",
-        description="Read a data set in the layout in which it is published and write one bag per sequence, with "
-        "images, calibration, given masks or boxes, and the ground truth (for evaluation only). Bags that are complete "
-        "already are left alone.",
+        help="a data set, a film or a folder of images to bags",
+        description="Read a film (`video`) or a folder of images (`images`) with a calibration, or a data set in the "
+        "layout in which it is published, and write one bag per sequence, with images, calibration, given masks or "
+        "boxes, and the ground truth (for evaluation only). Bags of data sets that are complete already are left "
+        "alone.",
     )
-    parser.add_argument("format", choices=FORMATS, help="layout of SRC")
-    parser.add_argument("source", type=Path, metavar="SRC", help="folder of the data set (or of one clip)")
+    parser.add_argument("format", choices=(*FORMATS, *FOOTAGE), help="layout of SRC")
+    parser.add_argument("source", type=Path, metavar="SRC", help="folder of the data set (or of one clip), or a film")
     parser.add_argument(
         "--out",
         required=True,
@@ -55,10 +57,14 @@ def _add_import(commands: Commands) -> None:
     )
     parser.add_argument("--check", action="store_true", help="also write a picture of the CAD projected by the labels")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    add_footage(parser)
     parser.set_defaults(command=_import)
 
 
 def _import(arguments: argparse.Namespace) -> int:
+    if arguments.format in FOOTAGE:
+        return import_footage(arguments)
+    refuse_footage_options(arguments)
     from hat_ros.bench.datasets.importer import import_dataset
     from hat_ros.cli.console import count_progress
 

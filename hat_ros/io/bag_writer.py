@@ -20,6 +20,7 @@ from hat_ros.errors import RunError
 from hat_ros.geometry import lie
 from hat_ros.io import messages, topics
 from hat_ros.io.images import encode_image
+from hat_ros.io.lens import Lens
 from hat_ros.io.manifest import TARGET_FILE, write_manifest
 from hat_ros.io.mcap_folder import McapFolder
 from hat_ros.io.rosbag import TYPESTORE
@@ -95,6 +96,7 @@ class BagWriter:
         *,
         mask: UInt8 | None = None,
         T_cam_target: Float | None = None,
+        lens: Lens | None = None,
     ) -> None:
         """Append one frame: image and camera_info, and what is known of mask and truth, all with the same stamp.
 
@@ -104,6 +106,7 @@ class BagWriter:
             camera: calibration.
             mask: (H, W) uint8, 255 silhouette, 128 box, 0 outside.
             T_cam_target: (4, 4) true pose.
+            lens: distortion of the image; None = it has none.
         """
         make, frame_id = self._wire, self.frame_id
         if mask is not None:
@@ -111,7 +114,7 @@ class BagWriter:
         if T_cam_target is not None:
             row = lie.row_from_matrix(T_cam_target)
             self.write_message(topics.GROUND_TRUTH, make.pose(stamp_ns, frame_id, row), stamp_ns)
-        self.write_message(topics.CAMERA_INFO, make.camera_info(stamp_ns, frame_id, camera), stamp_ns)
+        self.write_message(topics.CAMERA_INFO, make.camera_info(stamp_ns, frame_id, camera, lens), stamp_ns)
         if not isinstance(image, bytes) and self._format == "raw":
             self.write_message(topics.IMAGE, make.image(stamp_ns, frame_id, "rgb8", image), stamp_ns)
             return
