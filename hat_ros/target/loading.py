@@ -20,6 +20,7 @@ from hat_ros.errors import MeshError
 from hat_ros.target.companions import say_once
 from hat_ros.target.mesh_file import read_scene, read_target_yaml
 from hat_ros.target.model import Surface, Target, area_vectors, triangle_areas
+from hat_ros.target.simplify import MAX_WORK_FACES, simplify
 from hat_ros.target.srgb import linear_from_srgb, srgb_from_linear
 from hat_ros.target.units import guess_unit_scale, warn_of_size
 
@@ -102,6 +103,9 @@ def target_from_scene(scene: trimesh.Scene, name: str, unit_scale: float = 1.0) 
         say_once(f"CAD model {name}: it has no colours and is taken as grey", logging.INFO)
     corners = np.concatenate([part.corners_m for part in parts]) * unit_scale
     _check_extent(corners, name, unit_scale)
+    kept = np.ones(len(corners), bool)
+    if len(corners) > MAX_WORK_FACES:
+        corners, kept = _simplified(corners, name)
     # Exporters split vertices at texture seams, with rounding noise: merge what a millionth of the extent separates.
     origin, extent = corners.min(axis=(0, 1)), np.ptp(corners.reshape(-1, 3), axis=0).max()
     grid = np.rint((corners - origin) / (1e-6 * extent))
@@ -111,7 +115,8 @@ def target_from_scene(scene: trimesh.Scene, name: str, unit_scale: float = 1.0) 
     _, first, index = np.unique(grid[keep].reshape(-1, 3), axis=0, return_index=True, return_inverse=True)
     vertices = corners[keep].reshape(-1, 3)[first]
     faces = index.reshape(-1, 3).astype(np.int32)
-    surface, face_rgb = _surface(parts, keep)
+    kept[kept] = keep
+    surface, face_rgb = _surface(parts, kept)
     digest = hashlib.sha256()
     for array in (vertices, faces, face_rgb):
         digest.update(np.ascontiguousarray(array).tobytes())
@@ -131,6 +136,17 @@ def _ordered_nodes(scene: trimesh.Scene) -> list[str]:
         return str(geometry_name), np.asarray(T, dtype=np.float64).tobytes()
 
     return sorted(scene.graph.nodes_geometry, key=key)
+
+
+def _simplified(corners: Float, name: str) -> tuple[Float, Bool]:
+    """Corners of fewer faces, and which of the faces they were."""
+    fewer = simplify(corners)
+    say_once(
+        f"CAD model {name}: {len(corners)} triangles, simplified to {len(fewer.corners)} for the work; vertices move "
+        f"by at most {np.sqrt(3) * fewer.cell:.2g} m",
+        logging.INFO,
+    )
+    return fewer.corners, fewer.keep
 
 
 @dataclass(frozen=True)
