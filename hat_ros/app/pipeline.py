@@ -16,6 +16,7 @@ from typing import Protocol
 
 from hat_ros.app.scheduler import StageScheduler
 from hat_ros.app.timing import STAGE_NAMES, LapClock, resident_mib
+from hat_ros.core.refusals import Refusals
 from hat_ros.core.sync import Admission
 from hat_ros.errors import FrameError
 from hat_ros.tracker import StageWrapper, Step
@@ -87,8 +88,7 @@ class Pipeline:
         self._method = create(self._scheduler.wrap)
         self._credits = credits if self._method.concurrent else 1
         self._admission = Admission(self._credits)
-        self.rejected = 0
-        self.first_rejection = ""
+        self.refusals = Refusals()
 
     @property
     def causal(self) -> bool:
@@ -96,7 +96,7 @@ class Pipeline:
         return self._method.causal
 
     def run(self, frames: Iterable[Frame | FrameError]) -> Iterator[Processed]:
-        """Process frames, answers in order; those with a late stamp or malformed are counted in ``rejected``.
+        """Process frames, answers in order; those with a late stamp or malformed are counted in ``refusals``.
 
         An error of the recording is raised after the answers to what was read before it.
         """
@@ -135,13 +135,13 @@ class Pipeline:
     def _admitted(self, attempts: _ReadAhead) -> Iterator[tuple[int, Frame, float]]:
         """Sequence number, frame and decoding time of the frames that may enter; asked only when there is credit."""
         for frame, decode_ms in attempts:
+            if isinstance(frame, FrameError):
+                self.refusals.add(str(frame))
+                continue
             try:
-                if isinstance(frame, FrameError):
-                    raise frame
                 seq = self._admission.admit(frame.stamp_ns)
             except FrameError as error:
-                self.rejected += 1
-                self.first_rejection = self.first_rejection or str(error)
+                self.refusals.add(f"frame {frame.stamp_ns}: {error}")
                 continue
             yield seq, frame, decode_ms
 

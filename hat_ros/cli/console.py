@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -75,6 +76,13 @@ def print_figures(folder: Path) -> None:
     Console().print(table)
 
 
+def print_refused(folder: Path) -> None:
+    """Say on stderr which frames of a run were refused and why; nothing where none was."""
+    figures = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    for reason in figures.get("refused_reasons", ()):
+        print(f"hat: refused {reason['count']} of {figures['frames']} frames: {reason['first']}", file=sys.stderr)
+
+
 def figure_lines(figures: dict[str, Any]) -> list[tuple[str, str]]:
     """Label and text of the figures that people ask for first."""
 
@@ -84,6 +92,8 @@ def figure_lines(figures: dict[str, Any]) -> list[tuple[str, str]]:
 
     lines = [
         ("frames", f"{figures['frames']} ({figures['valid']} with a pose, coverage {number('coverage', '.1%')})"),
+        *[("refused", f"{reason['count']} x {reason['first']}") for reason in figures.get("refused_reasons", ())],
+        *([("dropped", str(figures["dropped"]))] if figures.get("dropped") else []),
         ("pose error E_p", f"{number('E_p_mean')} (SD {number('E_p_sd')})"),
         ("translation error E_t", f"{number('E_t_m_mean')} m (SD {number('E_t_m_sd')})"),
         ("rotation error E_q", f"{number('E_q_deg_mean', '.2f')} deg (SD {number('E_q_deg_sd', '.2f')})"),

@@ -71,7 +71,7 @@ def _add_credits(parser: argparse.ArgumentParser, default: str) -> None:
 
 def _replay(arguments: argparse.Namespace) -> int:
     from hat_ros.bench.runs.replay import ReplayOptions, replay_bag
-    from hat_ros.cli.console import print_figures, state_progress
+    from hat_ros.cli.console import print_figures, print_refused, state_progress
 
     options = ReplayOptions(
         graph=arguments.graph,
@@ -83,6 +83,7 @@ def _replay(arguments: argparse.Namespace) -> int:
     )
     with state_progress("replaying", arguments.quiet) as watch:
         folder = replay_bag(arguments.bag, arguments.out, config_of(arguments), options, watch)
+    print_refused(folder)
     if not arguments.quiet:
         print_figures(folder)
     return 0
@@ -118,7 +119,7 @@ def _add_track(commands: Commands) -> None:
 def _track(arguments: argparse.Namespace) -> int:
     limit_threads(arguments.threads)
     from hat_ros.bench.runs.track import TrackOptions, track
-    from hat_ros.cli.console import print_figures, state_progress
+    from hat_ros.cli.console import print_figures, print_refused, state_progress
 
     spec = spec_of(arguments)
     options = TrackOptions(
@@ -128,6 +129,7 @@ def _track(arguments: argparse.Namespace) -> int:
     )
     with state_progress("tracking", arguments.quiet) as watch:
         folder = track(spec, arguments.out, config_of(arguments), options, watch)
+    print_refused(folder)
     if not arguments.quiet:
         print_figures(folder)
     return 0

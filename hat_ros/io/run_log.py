@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -29,12 +29,11 @@ class RunLog:
         alignment_version: (N,) version of the Sim(3) in force, 0 = none yet.
         slam_epoch: (N,) epoch of the motion.
         gap_frames: (N,) frames since the last measurement.
-        dropped_total: frames that were not admitted (duplicate, backward or malformed stamps; live drops).
+        dropped_total: frames known not to have been admitted (refused, or dropped live) when the last one was.
         candidates: N sets of hypotheses, empty between keyframes.
         motion_valid: (N,) a motion was known.
         motion_rows: (N, 7) ``T_slam_cam``.
         truth_rows: (N, 7) true ``T_cam_target``.
-        unanswered_rows: (M, 7) truth of stamps for which no frame was admitted.
     """
 
     stamp_ns: Int
@@ -52,7 +51,6 @@ class RunLog:
     motion_valid: Bool
     motion_rows: Float
     truth_rows: Float
-    unanswered_rows: Float = field(default_factory=lambda: np.zeros((0, 7)))
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
@@ -102,9 +100,7 @@ class RunLog:
         """The same run beside another truth: exact stamp -> pose row (7,)."""
         nothing = np.full(7, np.nan)
         rows = np.array([truth.get(int(stamp), nothing) for stamp in self.stamp_ns]).reshape(-1, 7)
-        answered = {int(stamp) for stamp in self.stamp_ns}
-        rest = np.array([row for stamp, row in sorted(truth.items()) if stamp not in answered]).reshape(-1, 7)
-        return replace(self, truth_rows=rows, unanswered_rows=rest)
+        return replace(self, truth_rows=rows)
 
 
 class RunLogBuilder:

@@ -75,6 +75,8 @@ RECORDED = (
 
 # Figure in the diagnostics of a stage's node: mean wall time per frame, milliseconds.
 STEP_MS = "step_ms"
+# Figure in the diagnostics of segmentation: JSON list of `count` and `first` sentence by reason.
+REFUSED_REASONS = "refused_reasons"
 
 # Columns of the table topics, in order; all FLOAT64.
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")

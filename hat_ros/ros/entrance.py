@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
+from hat_ros.core.refusals import Refusals
 from hat_ros.core.sync import Admission
 from hat_ros.errors import FrameError
 from hat_ros.io import messages
@@ -25,6 +26,7 @@ class Entrance:
 
     Attributes:
         dropped_total: images that were replaced, lost by the middleware, or refused.
+        refusals: those that were refused.
     """
 
     def __init__(self, live: bool, with_masks: bool, image_depth: str = "auto") -> None:
@@ -36,6 +38,7 @@ class Entrance:
         self._image_depth = image_depth
         self._decoder: FrameDecoder | None = None
         self.dropped_total = 0
+        self.refusals = Refusals()
 
     def __len__(self) -> int:
         """Images that wait."""
@@ -101,6 +104,7 @@ class Entrance:
         except FrameError as error:
             self._images.popleft()
             self.dropped_total += 1
+            self.refusals.add(f"frame {stamp_ns}: {error}")
             raise FrameError(f"frame {stamp_ns} refused: {error}") from None
         self._images.popleft()
         return frame, message.header.frame_id

@@ -20,6 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from hat_ros.array_types import Float
 from hat_ros.config import HatConfig, config_to_dict
+from hat_ros.core.refusals import Refusals
 from hat_ros.errors import ConfigError
 from hat_ros.io.bag_reader import BagReader
 from hat_ros.ros.domain import reserved_domain
@@ -37,7 +38,8 @@ class ReplayResult:
     Attributes:
         played: frames sent into the graph.
         answered: statuses that came back.
-        dropped: frames that were not admitted (live drops, rejected frames).
+        dropped: frames that were not admitted (live drops, refused frames).
+        refusals: those that were refused.
         wall_s: from the first frame sent to the last status.
         latency_ms: (answered,) from sending a frame to its status.
         peak_memory_mib: sum of the node processes' peak resident memory.
@@ -46,6 +48,7 @@ class ReplayResult:
     played: int
     answered: int
     dropped: int
+    refusals: Refusals
     wall_s: float
     latency_ms: Float
     peak_memory_mib: float
@@ -145,6 +148,7 @@ def _measured(run: ReplayRun, processes: StageProcesses) -> ReplayResult:
         played=playback.sent,
         answered=playback.answered,
         dropped=playback.dropped,
+        refusals=playback.refusals,
         wall_s=playback.progress_s - min(playback.sent_s.values()) if playback.sent_s else 0.0,
         latency_ms=1e3 * np.array(playback.latency_s),
         peak_memory_mib=processes.peak_memory_mib,

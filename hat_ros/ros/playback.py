@@ -7,6 +7,7 @@ from collections.abc import Generator
 from typing import Any
 
 from hat_ros.config import GraphConfig
+from hat_ros.core.refusals import Refusals
 from hat_ros.io import messages
 from hat_ros.io.bag_reader import BagReader, Packet
 from hat_ros.ros.timeouts import answer_limit, check_progress
@@ -30,6 +31,7 @@ class Playback:
         sent: images sent so far.
         answered: statuses received.
         dropped: images known to be dropped or refused.
+        refusals: those that are known to be refused.
         last_status: the newest status.
         sent_s: stamp -> monotonic time at which the image was sent.
         latency_s: from sending an image to its status, in order of the statuses.
@@ -47,6 +49,7 @@ class Playback:
         self.total = max(0, len(bag) - first_frame)
         self.total = min(self.total, max_frames or self.total)
         self.sent = self.answered = self.dropped = 0
+        self.refusals = Refusals()
         self.last_status: messages.Status | None = None
         self.sent_s: dict[int, float] = {}
         self.latency_s: list[float] = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from functools import partial
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 from rclpy.duration import Duration
 
+from hat_ros.core.refusals import Refusals
 from hat_ros.errors import ConfigError
 from hat_ros.io import messages, topics
 from hat_ros.io.bag_reader import BagReader, Packet
@@ -83,6 +85,7 @@ class PlayerSession(Session):
             if name == "segmentation":
                 counts = {item.key: item.value for item in status.values}
                 self.playback.note_dropped(int(counts.get("dropped", 0)))
+                self.playback.refusals = Refusals.from_records(json.loads(counts.get(topics.REFUSED_REASONS, "[]")))
 
     def feed(self) -> None:
         """Send what may be sent now; at the end, end the stream.

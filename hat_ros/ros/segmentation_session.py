@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from functools import partial
 from typing import Any
 
@@ -73,6 +74,8 @@ class SegmentationSession(Session):
             "admitted": self._in_flight.admitted,
             "dropped": self._entrance.dropped_total,
             "in_flight": in_flight,
+            "refused": self._entrance.refusals.total,
+            topics.REFUSED_REASONS: json.dumps(self._entrance.refusals.records()),
         }
         return counts | self._step_timer.values()
 

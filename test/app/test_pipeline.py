@@ -22,7 +22,7 @@ def run(frames):
 def test_frames_pass_in_order():
     done, pipeline, method = run(frame(i) for i in range(5))
     assert [d.step.estimate.stamp_ns for d in done] == [stamp(i) for i in range(5)]
-    assert pipeline.rejected == 0
+    assert pipeline.refusals.total == 0
     assert len(method.seen) == 5
 
 
@@ -30,7 +30,10 @@ def test_duplicate_backward_and_malformed_frames_are_counted_and_change_nothing(
     clean, _, _ = run(frame(i) for i in range(4))
     dirty = [frame(0), frame(0), FrameError("black"), frame(1), frame(0), frame(2), frame(1), frame(3)]
     done, pipeline, _ = run(dirty)
-    assert pipeline.rejected == 4
+    stale, black = pipeline.refusals.records()
+    assert stale["count"] == 3
+    assert stale["first"].startswith(f"frame {stamp(0)}: header.stamp must increase")
+    assert black == {"count": 1, "first": "black"}
     for a, b in zip(clean, done, strict=True):
         np.testing.assert_array_equal(a.step.estimate.pose_row, b.step.estimate.pose_row)
 
@@ -40,7 +43,7 @@ def test_stamp_that_is_no_time_is_rejected(bad_stamp):
     first = frame(0)
     object.__setattr__(first, "stamp_ns", bad_stamp)
     done, pipeline, _ = run([first, frame(1)])
-    assert (len(done), pipeline.rejected) == (1, 1)
+    assert (len(done), pipeline.refusals.total) == (1, 1)
 
 
 def test_frames_are_read_by_one_thread_and_an_error_of_reading_ends_the_run():
@@ -89,7 +92,7 @@ def test_bag_is_a_source_and_a_broken_image_does_not_end_it(bag):
     assert sorted(source.truth_rows()) == [stamp(i) for i in range(4)]
     done, pipeline, _ = run(source.frames())
     assert [d.step.estimate.stamp_ns for d in done] == [stamp(i) for i in (0, 1, 2, 3, 5)]
-    assert pipeline.rejected == 1
+    assert pipeline.refusals.total == 1
 
 
 def test_start_and_limit_pick_frames(bag):

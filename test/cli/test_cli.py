@@ -263,3 +263,28 @@ def test_temporal_answers_causally_or_over_the_whole_clip(tmp_path):
         with np.load(tmp_path / f"{mode}.npz") as written:
             np.testing.assert_array_equal(written["T_cam_target"], expected.T_cam_target)
             assert {"T_cam_target", "chosen", "accepted", "resets"} <= set(written)
+
+
+def test_frames_that_are_refused_are_counted_and_said(scripted, settings, tmp_path, capsys):
+    """The clock steps back, then a second camera sends images of another size."""
+    model = tmp_path / "cubesat.glb"
+    write_model("cubesat", model)
+    with BagWriter(tmp_path / "clip", image_format="png") as writer:
+        for i in (0, 1, 2, 3, 4, 5, 1, 2):
+            writer.write_frame(stamp(i), frame(i).rgb, CAMERA, T_cam_target=lie.matrix_from_row(true_row(i)))
+        for i in (6, 7):
+            writer.write_frame(stamp(i), frame(i).rgb[:20], CAMERA)
+        writer.write_target(model)
+    assert main(["track", str(tmp_path / "clip"), "--out", str(tmp_path / "out"), "--config", settings]) == 0
+    said = capsys.readouterr()
+    assert f"hat: refused 2 of 10 frames: frame {stamp(1)}: header.stamp must increase" in said.err
+    assert f"hat: refused 2 of 10 frames: frame {stamp(6)}: image" in said.err
+    assert "2 x frame" in said.out
+    for name in ("metrics.json", "run.json"):
+        found = json.loads((tmp_path / "out" / name).read_text())
+        assert (found["refused"], [reason["count"] for reason in found["refused_reasons"]]) == (4, [2, 2]), name
+    figures = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert (figures["frames"], figures["dropped"], figures["valid"], figures["coverage"]) == (10, 0, 5, 0.5)
+    assert "Frames refused" in (tmp_path / "out" / "report.html").read_text()
+    assert main(["evaluate", str(tmp_path / "out")]) == 0
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text()) == figures

@@ -87,7 +87,8 @@ def test_refused_images_are_counted_and_the_next_one_enters(bad, complaint):
     waiting.add_image("/image", image(10), 3)
     with pytest.raises(FrameError, match=complaint):
         waiting.next_frame(admission)
-    assert waiting.dropped_total == 1
+    assert waiting.dropped_total == waiting.refusals.total == 1
+    assert complaint.split(": ")[-1].strip(".*") in str(waiting.refusals)
     assert enter(waiting, admission) == 1
 
 

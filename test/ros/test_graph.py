@@ -94,7 +94,9 @@ def test_rejected_frames_are_counted_and_change_nothing(write_bag, config, in_pr
         return rgb
 
     measured, found = play(write_bag("dirty", spoil), config, tmp_path / "out", graph="single")
-    assert (measured.answered, measured.dropped) == (N_FRAMES, 6)
+    assert (measured.played, measured.answered, measured.dropped) == (N_FRAMES + 6, N_FRAMES, 6)
+    reasons = {record["first"].split(": ", 1)[1][:24]: record["count"] for record in measured.refusals.records()}
+    assert reasons == {"header.stamp must be pos": 1, "header.stamp must increa": 4, "image is 160x50 px but c": 1}
     for topic in set(in_process) - {topics.STATUS, topics.ADMISSION}:
         assert found[topic] == in_process[topic], topic
     assert status_column(found, "dropped_total")[-1] == 6

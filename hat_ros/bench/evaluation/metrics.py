@@ -94,11 +94,17 @@ def summarise(errors: PoseErrors) -> dict[str, float]:
     }
 
 
-def coverage(has_output: Bool, has_truth: Bool) -> dict[str, Any]:
-    """Targets, valid outputs and their share; targets are the frames with ground truth, or all if there is none."""
+def coverage(has_output: Bool, has_truth: Bool, unanswered: int = 0) -> dict[str, Any]:
+    """Targets, valid outputs and their share.
+
+    Args:
+        has_output: (N,) admitted frames with a pose.
+        has_truth: (N,) admitted frames with ground truth; where there is none at all, every frame is a target.
+        unanswered: frames that were refused or dropped; every one is a target without a pose.
+    """
     targets = has_truth if has_truth.any() else np.ones(len(has_output), dtype=bool)
     valid = int(np.count_nonzero(has_output & targets))
-    n_targets = int(np.count_nonzero(targets))
+    n_targets = int(np.count_nonzero(targets)) + unanswered
     return {"targets": n_targets, "valid": valid, "coverage": valid / n_targets if n_targets else float("nan")}
 
 

@@ -27,8 +27,9 @@ pre { background: #f4f6f8; padding: .8em; overflow-x: auto; font-size: .85em; } 
 
 # metrics.json name, what people read, format, factor.
 _FIGURES = (
-    ("frames", "frames admitted", "d"),
-    ("dropped", "frames rejected", "d"),
+    ("frames", "frames of the recording", "d"),
+    ("refused", "frames refused", "d"),
+    ("dropped", "frames dropped", "d"),
     ("valid", "frames with a pose", "d"),
     ("coverage", "coverage", ".1%"),
     ("E_p_mean", "E_p mean", ".4f"),
@@ -77,6 +78,7 @@ def write_report(
     parts = [
         f"<h1>{html.escape(title)}</h1>",
         _figure_table(metrics),
+        _refusals(metrics.get("refused_reasons", ())),
         "<h2>Over time</h2>",
         _image(figures.image_bytes(figures.error_figure(log)), "errors over time"),
         '<p class="note">Background: state of the output. Crosses: best of the K candidates at keyframes; dots: the '
@@ -110,6 +112,15 @@ def _figure_table(metrics: dict[str, Any]) -> str:
         if value is not None and np.isfinite(value):
             rows.append(f'<tr><td>{label}</td><td class="n">{value:{form}}</td></tr>')
     return f"<table>{''.join(rows)}</table>"
+
+
+def _refusals(reasons: Sequence[dict[str, Any]]) -> str:
+    """Why frames were refused: the number of cases and the first of each reason; empty where none was."""
+    rows = [
+        f'<tr><td class="n">{int(reason["count"])}</td><td>{html.escape(reason["first"])}</td></tr>'
+        for reason in reasons
+    ]
+    return f"<h2>Frames refused</h2><table>{''.join(rows)}</table>" if rows else ""
 
 
 def _image(data: bytes, description: str, kind: str = "png") -> str:

@@ -61,9 +61,9 @@ def complete_folder(folder: Path, source: Source | None, measured: dict[str, Any
         BagError: the result bag is missing or damaged.
     """
     log = read_result_bag(folder / BAG_FOLDER)
-    figures = score_run(log, source.target if source else None) | measured
-    write_tables(folder, log)
     run = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+    figures = _score(log, source, run) | measured
+    write_tables(folder, log)
     if run.get("mode") == "observe":
         save_observations(folder / OBSERVATIONS_FILE, log)
     write_json(folder / METRICS_FILE, figures)
@@ -91,10 +91,17 @@ def evaluate_folder(folder: Path, truth: Path | None = None) -> None:
         log = log.with_truth({stamp: row for stamp, row in source.truth_rows().items() if first <= stamp <= last})
         if not log.has_truth.any():
             raise BagError(f"{truth} has no ground truth at any stamp of {folder}: is it the recording of this run?")
-    figures |= score_run(log, source.target if source else None)
+    figures |= _score(log, source, run)
     write_tables(folder, log)
     write_json(folder / METRICS_FILE, figures)
     _report(folder, log, figures, paint_overlay(folder, source, log, video=False) if source else [])
+
+
+def _score(log: RunLog, source: Source | None, run: dict[str, Any]) -> dict[str, Any]:
+    """The figures of a run, with the frames that ``run.json`` says were played and refused."""
+    target = source.target if source else None
+    figures = score_run(log, target, run.get("played"), run.get("refused", 0))
+    return figures | {"refused_reasons": run.get("refused_reasons", [])}
 
 
 def write_tables(path: Path, log: RunLog) -> None:

@@ -16,24 +16,25 @@ from hat_ros.types import TrackState
 ADD_S_POINTS = 1000
 
 
-def score_run(log: RunLog, target: Target | None = None) -> dict[str, Any]:
+def score_run(log: RunLog, target: Target | None = None, played: int | None = None, refused: int = 0) -> dict[str, Any]:
     """Every figure that a run and its ground truth give; without ground truth the errors are NaN.
 
     Args:
         log: the run.
         target: the CAD model, for ADD-S.
+        played: frames of the recording that the run was given; None = not known, those that the log knows of.
+        refused: how many of them were refused; the others that have no answer were dropped.
 
     Returns:
         Plain numbers and lists under the names of ``metrics.json``.
     """
     errors = metrics.pose_errors(log.T_est, log.T_true)
-    has_output = np.concatenate([log.has_output, np.zeros(len(log.unanswered_rows), bool)])
-    has_truth = np.concatenate([log.has_truth, np.ones(len(log.unanswered_rows), bool)])
     inside = metrics.inside_ellipsoid(log.T_est, log.covariance, log.T_true)
     steps = metrics.relative_motion_deg(log.motion_rows, log.motion_valid, log.slam_epoch, log.T_true)
     keyframes = np.flatnonzero(log.keyframe)
-    out: dict[str, Any] = {"frames": len(log), "dropped": log.dropped_total}
-    out |= metrics.coverage(has_output, has_truth)
+    unanswered = log.dropped_total if played is None else max(0, played - len(log))
+    out: dict[str, Any] = {"frames": len(log) + unanswered, "refused": refused, "dropped": unanswered - refused}
+    out |= metrics.coverage(log.has_output, log.has_truth, unanswered)
     out |= metrics.summarise(errors)
     out |= {f"state_{state.name.lower()}": int(np.count_nonzero(log.state == state)) for state in TrackState}
     out |= {

@@ -17,8 +17,9 @@ from hat_ros.array_types import Float
 from hat_ros.bench.datasets.image_files import ImageRecording
 from hat_ros.bench.datasets.pose_files import read_poses
 from hat_ros.bench.evaluation.result_folder import complete_folder
-from hat_ros.bench.runs.folder import RunOptions, result_folder
+from hat_ros.bench.runs.folder import RunOptions, record_frames, result_folder
 from hat_ros.bench.source import Source, SourceSpec
+from hat_ros.core.refusals import Refusals
 from hat_ros.errors import InputError, UsageError
 from hat_ros.io.bag_reader import BagReader
 from hat_ros.io.provenance import input_hash
@@ -70,6 +71,7 @@ def score_poses(spec: SourceSpec, poses: Path, out: Path, options: ScoreOptions)
     }
     with result_folder(folder, spec, None, mode=options.method, **how):
         _write_bag(folder.bag_path, source, stamps, rows)
+        record_frames(folder.path, len(stamps), Refusals())
         fps = options.fps if options.fps is not None else _rate(found.seconds)
         measured = {"fps": fps, "latency_ms_p50": float("nan"), "latency_ms_p99": float("nan")}
         complete_folder(folder.path, source, measured, video=options.video, report=options.report)

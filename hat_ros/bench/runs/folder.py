@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from typing import Any
 from hat_ros.bench.evaluation.result_folder import complete_folder
 from hat_ros.bench.source import SourceSpec
 from hat_ros.config import HatConfig
+from hat_ros.core.refusals import Refusals
 from hat_ros.errors import HatError, RunError
 from hat_ros.io.provenance import describe_run
 from hat_ros.io.results import CONFIG_FILE, RUN_FILE, ResultFolder, write_config, write_json
@@ -37,6 +39,18 @@ class RunOptions:
     video: bool = True
     report: bool = True
     overwrite: bool = False
+
+
+def record_frames(folder: Path, played: int, refusals: Refusals) -> None:
+    """Put into ``run.json`` how many frames the run was given, and which of them were refused."""
+    run = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+    counts = {"played": played, "refused": refusals.total, "refused_reasons": refusals.records()}
+    write_json(folder / RUN_FILE, run | counts)
+
+
+def no_frame_used(path: Path, refusals: Refusals) -> str:
+    """The sentence about a recording of which every frame was refused."""
+    return f"no frame of {path} could be used, {refusals.total} were refused: {refusals}"
 
 
 @contextmanager

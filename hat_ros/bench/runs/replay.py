@@ -11,10 +11,10 @@ import numpy as np
 
 from hat_ros.app.timing import WARMUP_FRAMES
 from hat_ros.bench.evaluation.result_folder import complete_folder
-from hat_ros.bench.runs.folder import RunOptions, Watcher, result_folder
+from hat_ros.bench.runs.folder import RunOptions, Watcher, no_frame_used, record_frames, result_folder
 from hat_ros.bench.source import SourceSpec
 from hat_ros.config import HatConfig
-from hat_ros.errors import MissingDependencyError, UsageError
+from hat_ros.errors import MissingDependencyError, RunError, UsageError
 from hat_ros.io.bag_reader import BagReader
 from hat_ros.io.result_bag import read_stage_ms
 from hat_ros.io.results import ResultFolder
@@ -94,6 +94,9 @@ def replay_bag(path: Path, out: Path, config: HatConfig, options: ReplayOptions,
             max_frames=options.limit,
             on_progress=progress,
         )
+        record_frames(folder.path, result.played, result.refusals)
+        if not result.answered and result.refusals.total:
+            raise RunError(no_frame_used(path, result.refusals))
         measured = _measured_by(result, clock) | _stage_times(folder.bag_path)
         complete_folder(folder.path, source, measured, video=options.video, report=options.report)
     return folder.final_path

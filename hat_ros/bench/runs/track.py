@@ -18,7 +18,7 @@ from hat_ros.bench.evaluation.metrics import mask_summary
 from hat_ros.bench.evaluation.result_folder import complete_folder
 from hat_ros.bench.evaluation.silhouettes import Silhouettes
 from hat_ros.bench.methods.modes import create_method
-from hat_ros.bench.runs.folder import RunOptions, Watcher, result_folder
+from hat_ros.bench.runs.folder import RunOptions, Watcher, no_frame_used, record_frames, result_folder
 from hat_ros.bench.source import Source, SourceSpec
 from hat_ros.config import HatConfig
 from hat_ros.errors import RunError, UsageError
@@ -102,7 +102,7 @@ def _run(
                     silhouettes.remember(done.step)
                 if pipeline.causal:
                     tables.add(done.step.estimate, rows[-1])
-                    bag.write_step(done.step, pipeline.rejected)
+                    bag.write_step(done.step, pipeline.refusals.total)
                 else:
                     steps.append(done.step)
                 if watch is not None:
@@ -112,15 +112,13 @@ def _run(
             finish_s = time.perf_counter() - last_answer_s
             for step, row in zip(final, rows[: len(steps)], strict=True):
                 tables.add(step.estimate, row)
-                bag.write_step(step, pipeline.rejected)
+                bag.write_step(step, pipeline.refusals.total)
         finally:
+            record_frames(folder, len(rows) + pipeline.refusals.total, pipeline.refusals)
             bag.write_context(source.recording.camera, source.truth_rows())
         overlaps = silhouettes.overlaps(source.masks(options.start, options.limit))
     if not rows:
-        raise RunError(
-            f"no frame of {source.path} could be used, {pipeline.rejected} were refused, the first because: "
-            f"{pipeline.first_rejection}"
-        )
+        raise RunError(no_frame_used(source.path, pipeline.refusals))
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     write_overlaps(folder, overlaps)
     speed, memory = latency_summary(rows, finish_s), {"peak_memory_mib": peak_mib} | memory_summary(rows)

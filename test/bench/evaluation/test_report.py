@@ -83,12 +83,17 @@ def test_score_run_has_the_promised_fields(tmp_path):
     assert json.loads((tmp_path / "m.json").read_text())["empty"] is None
 
 
-def test_truth_that_no_frame_answers_lowers_coverage():
+def test_frames_without_an_answer_lower_coverage():
     builder = RunLogBuilder()
     for step in steps(6):
         builder.add(step.candidates, step.motion, step.estimate)
-    figures = score_run(builder.build(truth(10)))
-    assert (figures["frames"], figures["targets"], figures["valid"]) == (6, 10, 5)
+    for known in (truth(6), {}):
+        figures = score_run(builder.build(known), played=10, refused=3)
+        assert (figures["frames"], figures["refused"], figures["dropped"]) == (10, 3, 1)
+        assert (figures["targets"], figures["valid"], figures["coverage"]) == (10, 5, 0.5)
+    builder.dropped_total = 4
+    stopped = score_run(builder.build(truth(6)))
+    assert (stopped["frames"], stopped["dropped"], stopped["coverage"]) == (10, 4, 0.5)
 
 
 def test_score_of_an_empty_run():
