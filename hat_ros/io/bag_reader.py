@@ -190,9 +190,7 @@ class BagReader:
         topic = f"{self.path}: topic {self.camera_info_topic}"
         if not self._counts[self.camera_info_topic]:
             return f"{topic} has no message: the calibration is missing"
-        return (
-            f"{topic} says that the camera is not calibrated, K is all zero: calibrate it, or write K into the messages"
-        )
+        return f"{topic} says that the camera is not calibrated, K has no focal length: calibrate it or give K"
 
     @property
     def camera(self) -> Camera:

@@ -52,7 +52,7 @@ class Calibration:
 
 
 def calibration_from(message: Any, image_topic: str, rectified: str) -> Calibration | None:
-    """Decode a CameraInfo; None for one that says "not calibrated" (K is all zero).
+    """Decode a CameraInfo; None for one that says "not calibrated" (no focal length in K).
 
     A rectified image is described by P. The pose is then in the rectified optical frame, which R turns from the raw
     one. A raw image is described by K; its distortion is undone, R is not applied, and the pose stays in the camera's
@@ -68,7 +68,7 @@ def calibration_from(message: Any, image_topic: str, rectified: str) -> Calibrat
             fit, or no way to tell which of the two images it is.
     """
     k, p = _matrix(message, "k", (3, 3)), _matrix(message, "p", (3, 4))[:, :3]
-    if not k.any():
+    if not k[:2, :2].any():
         return None
     d = np.asarray(message.d, dtype=np.float64).ravel()
     alike = not p.any() or _close(k, p, _ALIKE)

@@ -41,6 +41,7 @@ class PlayerSession(Session):
             camera_info_topic=extra["camera_info_topic"] or None,
             camera_config=settings.config.camera,
         )
+        self._calibration = self._bag.calibration
         choice = {name: extra[name] for name in ("rate", "first_frame", "max_frames")}
         self.playback = Playback(self._bag, self._config, live=settings.live, **choice)
         self.texts: dict[str, str] = {}
@@ -115,7 +116,7 @@ class PlayerSession(Session):
     def _send(self, packet: Packet) -> None:
         if self.playback.sent == 1:
             camera_info = self._wire.camera_info(
-                packet.stamp_ns, self._bag.frame_id, self._bag.camera, self._bag.calibration.lens
+                packet.stamp_ns, self._bag.frame_id, self._calibration.camera, self._calibration.lens
             )
             self._camera_info.publish(camera_info)
         if self._mask is not None:

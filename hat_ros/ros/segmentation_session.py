@@ -90,7 +90,9 @@ class SegmentationSession(Session):
     def _on_camera_info(self, message: Any) -> None:
         calibration = calibration_from(message, self._image_topic, self._rectified)
         if calibration is None:
-            self._diagnostics.report(WARN, f"{topics.CAMERA_INFO} says that the camera is not calibrated: K is zero")
+            self._diagnostics.report(
+                WARN, f"{topics.CAMERA_INFO} says that the camera is not calibrated: K has no focal length"
+            )
             return
         if self._entrance.set_calibration(calibration):
             self._camera_sent = False

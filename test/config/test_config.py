@@ -326,3 +326,19 @@ def test_every_option_describes_itself_and_accepts_its_default():
         node[last] = value
         config_from_dict(section)
     assert dataclasses.is_dataclass(HatConfig)
+
+
+@pytest.mark.parametrize(("text", "word"), [("true", "true"), ("false", "false"), ("auto", "auto"), ("'true'", "true")])
+def test_words_that_yaml_takes_for_something_else_stay_words(text, word):
+    assert load_config("default", [f"camera.rectified={text}"]).camera.rectified == word
+
+
+@pytest.mark.parametrize(("text", "word"), [("12", "12"), ("16", "16"), ("auto", "auto")])
+def test_a_depth_is_a_word_or_a_number(text, word):
+    assert load_config("default", [f"camera.image_depth={text}"]).camera.image_depth == word
+
+
+@pytest.mark.parametrize("override", ["camera.rectified=1", "camera.image_depth=7", "camera.image_depth=true"])
+def test_other_words_are_refused(override):
+    with pytest.raises(ConfigError, match="must be one of auto"):
+        load_config("default", [override])

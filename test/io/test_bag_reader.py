@@ -9,6 +9,7 @@ import pytest
 from recording import CAMERA, WIRE, N, image, mask, stamp
 from rosbags.rosbag2 import StoragePlugin, Writer
 
+from hat_ros.config import CameraConfig
 from hat_ros.errors import BagError, FrameError, HatError
 from hat_ros.io import topics
 from hat_ros.io.bag_reader import BagReader
@@ -192,3 +193,47 @@ def test_compressed_storage_modes_are_refused_with_advice(bag, tmp_path):
     (copy / "metadata.yaml").write_text(metadata)
     with pytest.raises(BagError, match="ros2 bag convert"):
         BagReader(copy)
+
+
+def calibrated(path, calibrations):
+    """A bag with these camera_info messages and one image."""
+    with BagWriter(path) as writer:
+        for index, message in enumerate(calibrations):
+            writer.write_message(topics.CAMERA_INFO, message, stamp(index))
+        writer.write_message(topics.IMAGE, WIRE.image(stamp(0), "c", "rgb8", image(0)), stamp(0))
+    return path
+
+
+def camera_info(share=1.0, p_share=1.0):
+    message = WIRE.camera_info(stamp(0), "c", CAMERA)
+    message.k[:6] *= share
+    message.p[:8] *= share * p_share
+    return message
+
+
+def test_empty_calibrations_are_skipped_and_jitter_is_none(tmp_path):
+    path = calibrated(tmp_path / "bag", [camera_info(0.0), *(camera_info(1 + 1e-7 * i) for i in range(4))])
+    assert np.array_equal(BagReader(path).camera.K, CAMERA.K)
+
+
+def test_only_empty_calibrations_are_one_sentence(tmp_path):
+    reader = BagReader(calibrated(tmp_path / "bag", [camera_info(0.0)] * 3))
+    with pytest.raises(BagError, match="/camera_info says that the camera is not calibrated, K has no focal length"):
+        _ = reader.camera
+
+
+def test_slow_drift_is_a_new_calibration_too(tmp_path):
+    reader = BagReader(calibrated(tmp_path / "bag", [camera_info(1 + 4e-7 * i) for i in range(9)]))
+    with pytest.raises(BagError, match=f"the calibration changes at stamp {stamp(0)}"):
+        _ = reader.camera
+
+
+@pytest.mark.parametrize(("option", "share"), [("true", 0.9), ("false", 1.0), ("auto", None)])
+def test_option_rectified_chooses_the_matrix(tmp_path, option, share):
+    path = calibrated(tmp_path / "bag", [camera_info(p_share=0.9)])
+    reader = BagReader(path, camera_config=CameraConfig(rectified=option))
+    if share is None:
+        with pytest.raises(FrameError, match="set rectified to true or false"):
+            _ = reader.camera
+    else:
+        assert reader.camera.K[0, 0] == pytest.approx(share * CAMERA.K[0, 0])

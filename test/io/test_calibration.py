@@ -128,8 +128,12 @@ def test_what_cannot_be_used_is_one_sentence(message, topic, complaint):
         calibration_from(message, topic, "auto")
 
 
-def test_a_camera_that_is_not_calibrated_gives_none():
-    assert calibration_from(info(k=np.zeros((3, 3)), p=np.zeros((3, 3))), "/image", "auto") is None
+@pytest.mark.parametrize(
+    "k", [np.zeros((3, 3)), np.diag([0.0, 0, 1]), np.array([[0.0, 0, 160], [0, 0, 120], [0, 0, 1]])]
+)
+@pytest.mark.parametrize("d", [NO_D, BARREL])
+def test_a_camera_that_is_not_calibrated_gives_none(k, d):
+    assert calibration_from(info(k=k, p=np.zeros((3, 3)), d=d), "/image", "auto") is None
 
 
 @pytest.mark.parametrize("model", LENSES)

@@ -29,6 +29,11 @@ def model(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def spec():
+    return SPEC
+
+
+@pytest.fixture(scope="session")
 def clip(model):
     return list(render_clip(load_target(model), SPEC))
 
