@@ -222,5 +222,6 @@ def _weights() -> list[Finding]:
             present.append(name)
         except HatError:
             continue
-    found = f"{weights_folder()}: {', '.join(present) or 'none; only the learned backends need them'}"
+    names = f"{', '.join(present)} (not read here: run `hat weights check`)"
+    found = f"{weights_folder()}: {names if present else 'none; only the learned backends need them'}"
     return [Finding("weights", "ok" if len(present) == len(CHECKPOINTS) else "optional", found)]

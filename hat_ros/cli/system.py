@@ -35,7 +35,8 @@ def _add_weights(commands: Commands) -> None:
     parser.add_argument(
         "action",
         choices=("list", "check", "convert"),
-        help="list: name, source, licence, place; check: presence and SHA-256; convert: pickled file to safetensors",
+        help="list: name, source, licence, place; check: presence, SHA-256, and that the network takes it; "
+        "convert: pickled file to safetensors",
     )
     parser.add_argument("name", nargs="?", help="one checkpoint (default: all)")
     parser.add_argument("--weights", type=Path, metavar="DIR", help="weights folder (default: $HAT_WEIGHTS)")
@@ -58,10 +59,13 @@ def _weights(arguments: argparse.Namespace) -> int:
         print(checkpoint.convert(arguments.name, arguments.source, arguments.weights))
         return 0
     if arguments.action == "check":
-        found = [checkpoint.check(name, arguments.weights) for name in names]
+        from hat_ros.nets.checkpoint_check import check
+
+        found = [check(name, arguments.weights) for name in names]
         for status in found:
             name = status.checkpoint.name
-            print(f"{name}: {'ok' if status.usable else 'missing'}: {status.message.removeprefix(f'{name}: ')}")
+            verdict = "ok" if status.usable else "missing" if status.path is None else "unusable"
+            print(f"{name}: {verdict}: {status.message.removeprefix(f'{name}: ')}")
         return 0 if all(status.usable for status in found) else 1
     table = Table(title=f"weights folder: {checkpoint.weights_folder(arguments.weights)}")
     for heading in ("name", "file below the folder", "size", "licence", "source", "SHA-256"):

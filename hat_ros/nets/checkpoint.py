@@ -15,7 +15,6 @@ import hashlib
 import os
 import pickle
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,23 +25,6 @@ if TYPE_CHECKING:
     import torch
 
 _NO_CHECKSUM = "none published"
-
-
-@dataclass(frozen=True)
-class WeightsStatus:
-    """What :func:`check` found for one checkpoint.
-
-    Attributes:
-        checkpoint: the entry asked about.
-        path: the file that a network would load, None when there is none.
-        usable: a network can load it as it is.
-        message: one sentence for people: what was found, and what to do if it is not usable.
-    """
-
-    checkpoint: Checkpoint
-    path: Path | None
-    usable: bool
-    message: str
 
 
 def weights_folder(folder: str | Path | None = None) -> Path:
@@ -99,26 +81,17 @@ def sha256_of(path: Path) -> str:
     return digest.hexdigest()
 
 
-def check(name: str, folder: str | Path | None = None) -> WeightsStatus:
-    """Whether a checkpoint is present and unaltered; reads bytes only, never tensors."""
-    entry = checkpoint_named(name)
-    try:
-        path = find(name, folder)
-    except WeightsError as error:
-        return WeightsStatus(entry, None, False, str(error))
-    if entry.library_folder:
-        return WeightsStatus(entry, path, True, f"{path}: folder present")
-    if path.suffix == ".safetensors":
-        return WeightsStatus(entry, path, True, f"{path}: present, SHA-256 {sha256_of(path)}")
-    files = ((path, entry.sha256), *((path.parent / Path(file).name, digest) for file, digest in entry.companions))
-    for file, digest in files:
+def verify_companions(entry: Checkpoint, folder: Path) -> None:
+    """Check the small files that belong beside a checkpoint.
+
+    Raises:
+        WeightsError: one is missing or altered.
+    """
+    for name, digest in entry.companions:
+        file = folder / Path(name).name
         if not file.is_file():
-            return WeightsStatus(entry, path, False, f"{file} is missing: get it from {entry.source}")
-        try:
-            _verify(entry, file, digest)
-        except WeightsError as error:
-            return WeightsStatus(entry, path, False, str(error))
-    return WeightsStatus(entry, path, True, f"{path}: present, published checksum confirmed")
+            raise WeightsError(f"{file} is missing: get it from {entry.source}")
+        _verify(entry, file, digest)
 
 
 def load_state(name: str, folder: str | Path | None = None) -> dict[str, torch.Tensor]:
@@ -136,13 +109,14 @@ def load_state(name: str, folder: str | Path | None = None) -> dict[str, torch.T
         return _read_safetensors(path)
     _verify(entry, path, entry.sha256)
     torch = _import("torch")
+    _refuse_program(path)
     try:
         data = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError:
         raise WeightsError(
             f"{path}: holds more than tensors, so it is not opened directly; run `hat weights convert {name}` once"
         ) from None
-    except (RuntimeError, OSError, EOFError) as error:
+    except Exception as error:  # of a damaged file the library lets out whatever its parsers meet
         raise WeightsError(f"{path}: is not a readable torch file ({_one_line(error)})") from None
     return _normalised(entry, path, data)
 
@@ -157,6 +131,16 @@ def load_into(module: torch.nn.Module, state: Mapping[str, torch.Tensor], name: 
 
     Raises:
         WeightsError: names or shapes differ, or a value is not finite.
+    """
+    verify_fit(module, state, name)
+    module.load_state_dict(dict(state), strict=True)
+
+
+def verify_fit(module: torch.nn.Module, state: Mapping[str, torch.Tensor], name: str) -> None:
+    """What :func:`load_into` requires, without copying; the network's own tensors need no values.
+
+    Raises:
+        WeightsError: as there.
     """
     wanted = module.state_dict()
     missing = [key for key in wanted if key not in state]
@@ -174,7 +158,6 @@ def load_into(module: torch.nn.Module, state: Mapping[str, torch.Tensor], name: 
             )
         if tensor.is_floating_point() and not tensor.isfinite().all():
             raise WeightsError(f"{name}: tensor '{key}' holds values that are not finite; get the file again")
-    module.load_state_dict(dict(state), strict=True)
 
 
 def convert(name: str, source: str | Path | None = None, folder: str | Path | None = None) -> Path:
@@ -189,7 +172,7 @@ def convert(name: str, source: str | Path | None = None, folder: str | Path | No
         folder: the weights folder.
 
     Raises:
-        WeightsError: the file is missing, altered, or holds no state dict.
+        WeightsError: the file is missing, altered, a TorchScript archive, or holds no state dict.
         MissingDependencyError: torch or safetensors is not installed.
     """
     entry = checkpoint_named(name)
@@ -203,9 +186,10 @@ def convert(name: str, source: str | Path | None = None, folder: str | Path | No
     torch, safetensors = _import("torch"), _import("safetensors.torch")
     from hat_ros.nets.inert_pickle import inert_pickle
 
+    _refuse_program(path)
     try:
         data = torch.load(path, map_location="cpu", weights_only=False, pickle_module=inert_pickle())
-    except (pickle.UnpicklingError, RuntimeError, OSError, EOFError) as error:
+    except Exception as error:  # of a damaged file the library lets out whatever its parsers meet
         raise WeightsError(f"{path}: is not a readable torch file ({_one_line(error)})") from None
     state = {key: tensor.clone().contiguous() for key, tensor in _normalised(entry, path, data).items()}
     root.mkdir(parents=True, exist_ok=True)
@@ -227,11 +211,31 @@ def _verify(entry: Checkpoint, path: Path, expected: str) -> str:
     return digest
 
 
+def _refuse_program(path: Path) -> None:
+    """Refuse a TorchScript archive: torch would run the code in it, whatever pickle reader it is given.
+
+    It is told by the entries that torch itself goes by, listed with torch's own reader: no other reading of the same
+    bytes can differ. A file that is no zip holds no such archive.
+    """
+    with path.open("rb") as stream:
+        if stream.read(4) != b"PK\x03\x04":
+            return
+    reader = _import("torch")._C.PyTorchFileReader
+    try:
+        records = reader(str(path)).get_all_records()
+    except RuntimeError as error:
+        raise WeightsError(f"{path}: is not a readable torch file ({_one_line(error)})") from None
+    if any(record == "constants.pkl" or record.startswith("code/") for record in records):
+        raise WeightsError(
+            f"{path}: is a TorchScript archive, a program instead of weights; it is not opened: get the state dict"
+        )
+
+
 def _read_safetensors(path: Path) -> dict[str, torch.Tensor]:
     safetensors, errors = _import("safetensors.torch"), _import("safetensors")
     try:
         return safetensors.load_file(str(path))
-    except (errors.SafetensorError, OSError) as error:
+    except (errors.SafetensorError, OSError, ValueError, KeyError, RuntimeError) as error:
         raise WeightsError(f"{path}: is not a readable safetensors file ({_one_line(error)})") from None
 
 

@@ -109,6 +109,7 @@ CHECKPOINTS: dict[str, Checkpoint] = {
             filename="gigaPose_v1.ckpt",
             source="https://huggingface.co/datasets/nv-nguyen/gigaPose (gigaPose_v1.ckpt)",
             licence="MIT",
+            sha256="0f60a23b03ddc41d2135c916ed1e66fb16f814f612dbde0305ae5a2c0f45c932",
             size="about 3.6 GB",
             container="state_dict",
         ),

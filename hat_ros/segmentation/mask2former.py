@@ -9,17 +9,15 @@ previous mask are best together; the paper does not publish its rule.
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-from transformers import Mask2FormerForUniversalSegmentation, Mask2FormerImageProcessorPil
 
 from hat_ros.array_types import Bool, Float32
 from hat_ros.config import HatConfig, Mask2FormerConfig
-from hat_ros.errors import WeightsError
 from hat_ros.nets.checkpoint import find
+from hat_ros.nets.mask2former_files import load_mask2former
 from hat_ros.nets.runtime import Runtime
 from hat_ros.target.model import Target
 from hat_ros.types import Detection, Frame, PosePrior
@@ -39,7 +37,7 @@ class Mask2FormerSegmenter:
         self._settings = config.segmentation.mask2former
         self._runtime = Runtime(config.nets)
         folder = find("mask2former", config.nets.weights_folder or None)
-        self._processor, model = _load(folder)
+        self._processor, model = load_mask2former(folder)
         # The library's decorator hides what the method takes.
         model = model.to(self._runtime.device)  # type: ignore[arg-type]
         self._model = model.eval().requires_grad_(False)
@@ -134,16 +132,3 @@ def _compactness(mask: Bool) -> float:
     points = cv2.findNonZero(mask.astype(np.uint8)).reshape(-1, 2)
     hull = cv2.contourArea(cv2.convexHull(points))
     return min(np.count_nonzero(mask) / max(hull, 1.0), 1.0)
-
-
-def _load(folder: Path) -> tuple[Mask2FormerImageProcessorPil, Mask2FormerForUniversalSegmentation]:
-    try:
-        processor = Mask2FormerImageProcessorPil.from_pretrained(folder, local_files_only=True)
-        model = Mask2FormerForUniversalSegmentation.from_pretrained(folder, local_files_only=True, use_safetensors=True)
-    except (OSError, ValueError, RuntimeError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise WeightsError(
-            f"mask2former: {folder} is not a complete folder (config.json, preprocessor_config.json, "
-            f"model.safetensors): {reason}"
-        ) from None
-    return processor, model

@@ -4,12 +4,15 @@ import os
 import pickle
 
 import pytest
+import torch
+from rule_weights import save_small_mask2former
+from safetensors.torch import load_file, save_file
 
 from hat_ros.errors import WeightsError
 from hat_ros.nets import checkpoint
-from hat_ros.nets.checkpoint import CHECKPOINTS, check, convert, find, load_into, load_state, weights_folder
-
-torch = pytest.importorskip("torch")
+from hat_ros.nets.checkpoint import CHECKPOINTS, convert, find, load_into, load_state, weights_folder
+from hat_ros.nets.checkpoint_check import _NETWORKS, check
+from hat_ros.nets.droid import DroidNet
 
 
 @pytest.fixture
@@ -80,9 +83,8 @@ def test_load_strips_opens_and_cuts(folder, toy, legacy):
     state = load_state("toy")
     assert set(state) == {"a.weight", "other"}
     assert torch.equal(state["a.weight"], weight[:2])
-    assert check("toy").usable
     converted = convert("toy")
-    assert converted == folder / "toy.safetensors" and find("toy") == converted and check("toy").usable
+    assert converted == folder / "toy.safetensors" and find("toy") == converted
     again = load_state("toy")
     assert set(again) == set(state) and all(torch.equal(again[k], state[k]) for k in state)
 
@@ -164,3 +166,81 @@ def test_registry_is_consistent():
         assert entry.name == name
         assert entry.sha256 == "" or len(entry.sha256) == 64
         assert all(len(digest) == 64 for _, digest in entry.companions)
+
+
+class _Script(torch.nn.Module):
+    """A module whose ``__setstate__`` runs when its archive is opened."""
+
+    def __init__(self):
+        super().__init__()
+        self.w = torch.nn.Parameter(torch.ones(2))
+
+    @torch.jit.export
+    def __getstate__(self):
+        return (self.w, self.training)
+
+    @torch.jit.export
+    def __setstate__(self, state: tuple[torch.Tensor, bool]):
+        print("the archive's code ran")
+        self.w = state[0]
+        self.training = state[1]
+
+    def forward(self, x):
+        return x * self.w
+
+
+def test_a_torchscript_archive_is_refused_before_anything_in_it_runs(folder, toy, capfd):
+    torch.jit.save(torch.jit.script(_Script()), str(folder / "toy.pth"))
+    torch.jit.load(str(folder / "toy.pth"))
+    assert "code ran" in capfd.readouterr().out, "opened as such, it does run"
+    for digest in ({}, {"sha256": ""}):
+        toy(folder / "toy.pth", **digest)
+        for action in (load_state, convert):
+            with pytest.raises(WeightsError, match="TorchScript archive"):
+                action("toy")
+    assert "code ran" not in capfd.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def good_droid():
+    return {key: torch.zeros_like(value) for key, value in DroidNet(None).state_dict().items()}
+
+
+def test_check_says_ok_of_what_the_network_takes_and_of_nothing_else(folder, good_droid):
+    path = folder / "droid.safetensors"
+    save_file(good_droid, str(path))
+    assert check("droid").usable and "all fit" in check("droid").message
+    name = next(iter(good_droid))
+    for spoiled, text in (
+        ({}, "tensors missing"),
+        ({k: v for k, v in good_droid.items() if k != name}, "1 tensors missing"),
+        (good_droid | {name: good_droid[name][:1]}, "must have shape"),
+        (good_droid | {name: torch.full_like(good_droid[name], float("inf"))}, "not finite"),
+    ):
+        save_file({key: value.contiguous() for key, value in spoiled.items()}, str(path))
+        status = check("droid")
+        assert not status.usable and text in status.message and status.path == path
+    for garbage in (b"", b"{}", b"\x02\0\0\0\0\0\0\0{}", os.urandom(500)):
+        path.write_bytes(garbage)
+        assert not check("droid").usable
+
+
+def test_check_reads_the_folder_of_the_library_too(folder):
+    save_small_mask2former(folder)
+    assert check("mask2former").usable
+    tensors = folder / CHECKPOINTS["mask2former"].filename / "model.safetensors"
+    state = load_file(str(tensors))
+    state.pop(sorted(state)[0])
+    for content in (state, {}):
+        save_file(content, str(tensors), metadata={"format": "pt"})
+        status = check("mask2former")
+        assert not status.usable and "lacks" in status.message
+    tensors.write_bytes(b"garbage")
+    assert not check("mask2former").usable
+
+
+def test_every_single_file_has_a_published_checksum_and_a_network():
+    for name, entry in CHECKPOINTS.items():
+        assert entry.library_folder or len(entry.sha256) == 64, name
+        assert entry.library_folder or not check(name, "/nonexistent").usable
+    assert set(_NETWORKS) == {name for name, entry in CHECKPOINTS.items() if not entry.library_folder}
