@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hat_ros.cli.options import Commands, add_dataset, add_extent, add_out, extent_of, spec_of
+from hat_ros.cli.options import Commands, add_camera, add_dataset, add_extent, add_out, extent_of, spec_of
 
 
 def add_commands(commands: Commands) -> None:
@@ -78,6 +78,7 @@ def _add_score(commands: Commands) -> None:
         "--poses", required=True, type=Path, metavar="FILE", help="TUM or BOP file, or folder of matrices"
     )
     parser.add_argument("--method", default="external", metavar="NAME", help="its name in tables (default: external)")
+    add_camera(parser)
     parser.add_argument("--fps", type=float, metavar="X", help="its frame rate, if you measured it")
     add_dataset(parser)
     parser.add_argument("--sequence", default="", metavar="NAME", help="which sequence of the data set")
@@ -89,8 +90,10 @@ def _add_score(commands: Commands) -> None:
 def _score(arguments: argparse.Namespace) -> int:
     from hat_ros.bench.runs.external import ScoreOptions, score_poses
     from hat_ros.cli.console import print_figures
+    from hat_ros.config import load_config
 
-    options = ScoreOptions(method=arguments.method, fps=arguments.fps, **extent_of(arguments))
+    camera = load_config("default", arguments.overrides).camera
+    options = ScoreOptions(method=arguments.method, fps=arguments.fps, camera=camera, **extent_of(arguments))
     folder = score_poses(spec_of(arguments), arguments.poses, arguments.out, options)
     if not arguments.quiet:
         print_figures(folder)

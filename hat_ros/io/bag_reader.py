@@ -18,7 +18,7 @@ from hat_ros.config import CameraConfig
 from hat_ros.errors import BagError, FrameError, HatError
 from hat_ros.geometry import lie
 from hat_ros.io import messages, topics
-from hat_ros.io.calibration import Calibration, calibration_from
+from hat_ros.io.calibration import Calibration, calibration_from, camera_info_topic_of
 from hat_ros.io.frame_decoder import FrameDecoder
 from hat_ros.io.integrity import check_mcap
 from hat_ros.io.manifest import TARGET_FILE, check_manifest
@@ -56,7 +56,8 @@ class BagReader:
         path: the bag's folder, or a single ``.mcap`` file.
         image_topic: topic of the images; found by itself when the bag has ``/image``, ``/image/compressed`` or only one
             image topic.
-        camera_info_topic: topic of the calibration; found likewise.
+        camera_info_topic: topic of the calibration; by default ``camera_info`` in the image's own namespace, else
+            found likewise.
         mask_topic: topic of given detections (mono8: 255 silhouette, 128 box, 0 outside).
         truth_topic: topic of true poses (PoseStamped, ``T_cam_target``); only for evaluation.
         camera_config: what the messages do not say of the camera; None = find out.
@@ -84,9 +85,8 @@ class BagReader:
             self._types = {c.topic: c.msgtype for c in reader.connections}
             self._counts = {c.topic: c.msgcount for c in reader.connections}
         self.image_topic = self._choose("image", image_topic, _IMAGE_TYPES, topics.IMAGE, topics.IMAGE_COMPRESSED)
-        self.camera_info_topic = self._choose(
-            "camera_info", camera_info_topic, (_CAMERA_INFO_TYPE,), topics.CAMERA_INFO
-        )
+        usual = camera_info_topic_of(self.image_topic), topics.CAMERA_INFO
+        self.camera_info_topic = self._choose("camera_info", camera_info_topic, (_CAMERA_INFO_TYPE,), *usual)
         self.mask_topic = self._optional("mask", mask_topic, _MASK_TYPE)
         self.truth_topic = self._optional("truth", truth_topic, _POSE_TYPE)
 

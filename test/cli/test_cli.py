@@ -288,3 +288,21 @@ def test_frames_that_are_refused_are_counted_and_said(scripted, settings, tmp_pa
     assert "Frames refused" in (tmp_path / "out" / "report.html").read_text()
     assert main(["evaluate", str(tmp_path / "out")]) == 0
     assert json.loads((tmp_path / "out" / "metrics.json").read_text()) == figures
+
+
+@pytest.mark.parametrize("command", ["track", "replay", "bench", "profile", "score"])
+def test_what_a_camera_does_not_say_can_be_told(command):
+    words = [command, "bag", "--rectified", "true", "--image-depth", "12"]
+    words += [] if command == "profile" else ["--out", "out"]
+    words += ["--poses", "poses.tum"] if command == "score" else []
+    overrides = build_parser().parse_args(words).overrides
+    camera = load_config("default", overrides).camera
+    assert (camera.rectified, camera.image_depth) == ("true", "12")
+
+
+@pytest.mark.parametrize("words", [["--rectified", "perhaps"], ["--image-depth", "7"], ["--image-depth", "true"]])
+def test_another_word_for_the_camera_is_bad_input(words, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["track", "bag", "--out", "out", *words])
+    assert stopped.value.code == 2
+    assert "must be one of auto" in capsys.readouterr().err

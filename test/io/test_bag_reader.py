@@ -237,3 +237,14 @@ def test_option_rectified_chooses_the_matrix(tmp_path, option, share):
             _ = reader.camera
     else:
         assert reader.camera.K[0, 0] == pytest.approx(share * CAMERA.K[0, 0])
+
+
+def test_of_several_calibrations_that_beside_the_image_counts(tmp_path):
+    other = Camera(CAMERA.K * 2 - np.diag([0, 0, 1]), CAMERA.width, CAMERA.height)
+    with BagWriter(tmp_path / "bag") as writer:
+        for topic, camera in (("/camera_info", other), ("/cam1/camera_info", CAMERA), ("/cam2/camera_info", other)):
+            writer.write_message(topic, WIRE.camera_info(stamp(0), "c", camera), stamp(0))
+        writer.write_message("/cam1/image_raw", WIRE.image(stamp(0), "c", "rgb8", image(0)), stamp(0))
+    reader = BagReader(tmp_path / "bag")
+    assert reader.camera_info_topic == "/cam1/camera_info"
+    assert np.array_equal(reader.camera.K, CAMERA.K)

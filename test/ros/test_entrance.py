@@ -130,3 +130,11 @@ def test_a_new_calibration_is_a_new_epoch_live_and_an_error_in_a_replay():
     assert live.set_calibration(Calibration(other))
     with pytest.raises(FrameError, match="camera_info changes during the run"):
         replay.set_calibration(Calibration(other))
+
+
+def test_a_calibration_that_jitters_is_no_new_one():
+    for live in (True, False):
+        waiting = entrance(live=live)
+        for index in range(50):
+            K = CAMERA.K * [[1 + 1e-8 * index] * 3, [1 - 1e-8 * index] * 3, [1] * 3]
+            assert not waiting.set_calibration(Calibration(Camera(K, 8, 6)))

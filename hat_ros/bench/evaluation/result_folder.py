@@ -19,8 +19,8 @@ from hat_ros.bench.evaluation.report import write_report
 from hat_ros.bench.evaluation.score import score_run
 from hat_ros.bench.observations import save_observations
 from hat_ros.bench.source import Source, SourceSpec, open_source
-from hat_ros.config import load_config
-from hat_ros.errors import BagError, HatError, RunError, UsageError
+from hat_ros.config import CameraConfig, load_config
+from hat_ros.errors import BagError, ConfigError, HatError, RunError, UsageError
 from hat_ros.io.result_bag import read_result_bag
 from hat_ros.io.results import BAG_FOLDER, CONFIG_FILE, METRICS_FILE, RUN_FILE, tum_line, write_json
 from hat_ros.io.run_log import RunLog
@@ -85,7 +85,7 @@ def evaluate_folder(folder: Path, truth: Path | None = None) -> None:
     """
     run, figures, _ = read_folder(folder)
     log = read_result_bag(folder / BAG_FOLDER)
-    source = _source_of(run, folder) if truth is None else open_source(truth)
+    source = _source_of(run, folder) if truth is None else open_source(truth, camera_config=_camera_of(folder))
     if truth is not None and source is not None:
         first, last = int(log.stamp_ns[0]), int(log.stamp_ns[-1])
         log = log.with_truth({stamp: row for stamp, row in source.truth_rows().items() if first <= stamp <= last})
@@ -168,12 +168,20 @@ def read_folder(folder: Path) -> tuple[dict[str, Any], dict[str, Any], str]:
         raise UsageError(f"{folder} is no finished result folder ({reason}): give the --out of a run") from None
 
 
+def _camera_of(folder: Path) -> CameraConfig:
+    """What a run was told of the camera; the default where its configuration is none of ours."""
+    try:
+        return load_config(folder / CONFIG_FILE).camera
+    except ConfigError:
+        return CameraConfig()
+
+
 def _source_of(run: dict[str, Any], folder: Path) -> Source | None:
     """The recording that a run was made from, None when it is no longer there."""
     try:
         model = run.get("model")
         spec = SourceSpec(Path(run["source"]), run.get("dataset", ""), run.get("sequence", ""), model and Path(model))
-        return spec.open(load_config(folder / CONFIG_FILE).camera)
+        return spec.open(_camera_of(folder))
     except HatError:
         return None
 

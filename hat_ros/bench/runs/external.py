@@ -7,7 +7,7 @@ folder, a row in the benchmark's table.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from hat_ros.bench.datasets.pose_files import read_poses
 from hat_ros.bench.evaluation.result_folder import complete_folder
 from hat_ros.bench.runs.folder import RunOptions, record_frames, result_folder
 from hat_ros.bench.source import Source, SourceSpec
+from hat_ros.config import CameraConfig
 from hat_ros.core.refusals import Refusals
 from hat_ros.errors import InputError, UsageError
 from hat_ros.io.bag_reader import BagReader
@@ -41,10 +42,12 @@ class ScoreOptions(RunOptions):
     Attributes:
         method: what the table calls it.
         fps: frames per second as measured by who ran it; None = from the file, if it says.
+        camera: what the messages of a bag do not say of the camera.
     """
 
     method: str
     fps: float | None = None
+    camera: CameraConfig = field(default_factory=CameraConfig)
 
 
 def score_poses(spec: SourceSpec, poses: Path, out: Path, options: ScoreOptions) -> Path:
@@ -55,7 +58,7 @@ def score_poses(spec: SourceSpec, poses: Path, out: Path, options: ScoreOptions)
         UsageError: ``out`` exists and must not be replaced.
     """
     folder = ResultFolder(out, options.overwrite)
-    source = spec.open()
+    source = spec.open(options.camera)
     stamps = frame_stamps(source, options.start, options.limit)
     scene = source.recording.scene if isinstance(source.recording, ImageRecording) else None
     found = read_poses(poses, scene)
