@@ -24,8 +24,7 @@ from hat_ros.io.lens import Lens
 from hat_ros.io.manifest import TARGET_FILE, write_manifest
 from hat_ros.io.mcap_folder import McapFolder
 from hat_ros.io.rosbag import TYPESTORE
-from hat_ros.target.companions import copy_with_companions
-from hat_ros.target.mesh_file import companions_of
+from hat_ros.target.mesh_file import copy_model
 from hat_ros.types import Camera
 
 IMAGE_FORMATS = ("raw", "png", "jpeg")
@@ -131,9 +130,9 @@ class BagWriter:
             name: name of the target, by default that of the file.
         """
         mesh = Path(mesh)
-        content = {"mesh": mesh.name, "unit_scale": float(unit_scale), "name": name or mesh.stem}
         with _as_run_error(self.path):
-            copy_with_companions(mesh, companions_of(mesh), self.path, mesh.name)
+            copy = copy_model(mesh, self.path)
+            content = {"mesh": copy, "unit_scale": float(unit_scale), "name": name or mesh.stem}
             (self.path / TARGET_FILE).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
 
     def close(self) -> None:

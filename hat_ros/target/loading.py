@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from hat_ros.array_types import Bool, Float, Float32, Int, UInt8
+from hat_ros.array_types import Bool, Float, Float32, Int, Int32, UInt8
 from hat_ros.errors import MeshError
 from hat_ros.target.companions import say_once
 from hat_ros.target.mesh_file import read_scene, read_target_yaml
@@ -112,9 +112,13 @@ def target_from_scene(scene: trimesh.Scene, name: str, unit_scale: float = 1.0) 
     keep = triangle_areas(grid) > 0
     if not keep.any():
         raise MeshError(f"CAD model {name}: every triangle has zero area")
-    _, first, index = np.unique(grid[keep].reshape(-1, 3), axis=0, return_index=True, return_inverse=True)
-    vertices = corners[keep].reshape(-1, 3)[first]
-    faces = index.reshape(-1, 3).astype(np.int32)
+    vertices, faces = _merged(corners, grid, keep)
+    empty = triangle_areas(vertices[faces]) == 0
+    if empty.any():  # corners in a line, which only the grid's rounding puts beside it
+        keep[np.flatnonzero(keep)[empty]] = False
+        if not keep.any():
+            raise MeshError(f"CAD model {name}: every triangle has zero area")
+        vertices, faces = _merged(corners, grid, keep)
     kept[kept] = keep
     surface, face_rgb = _surface(parts, kept)
     digest = hashlib.sha256()
@@ -136,6 +140,12 @@ def _ordered_nodes(scene: trimesh.Scene) -> list[str]:
         return str(geometry_name), np.asarray(T, dtype=np.float64).tobytes()
 
     return sorted(scene.graph.nodes_geometry, key=key)
+
+
+def _merged(corners: Float, grid: Float, keep: Bool) -> tuple[Float, Int32]:
+    """Vertices (V, 3) and faces (F, 3) of the kept triangles; corners at one place of the grid are one vertex."""
+    _, first, index = np.unique(grid[keep].reshape(-1, 3), axis=0, return_index=True, return_inverse=True)
+    return corners[keep].reshape(-1, 3)[first], index.reshape(-1, 3).astype(np.int32)
 
 
 def _simplified(corners: Float, name: str) -> tuple[Float, Bool]:

@@ -15,11 +15,12 @@ import trimesh
 import yaml
 
 from hat_ros.errors import MeshError
-from hat_ros.target.companions import MATERIAL_SUFFIX, Companions, say_once
+from hat_ros.target.brep import BREP_SUFFIXES, glb_of_brep
+from hat_ros.target.companions import MATERIAL_SUFFIX, Companions, copy_with_companions, say_once
 from hat_ros.target.obj_text import material_libraries, plain_obj
 from hat_ros.target.units import AUTO
 
-MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb")
+MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb", *BREP_SUFFIXES)
 MAX_FILE_BYTES = 256 * 2**20
 MAX_FACES = 4_000_000
 MAX_VERTICES = 8_000_000
@@ -74,6 +75,29 @@ def companions_of(path: Path) -> dict[str, Path]:
     return _read(path)[1].found if is_named else {}
 
 
+def copy_model(mesh: Path, folder: Path, stem: str | None = None) -> str:
+    """Copy a mesh and what it names into a folder; STEP and IGES as the GLB that they become, for any machine to read.
+
+    Args:
+        mesh: the file.
+        folder: where to.
+        stem: name there without suffix, by default the file's own.
+
+    Returns:
+        Name of the copy.
+
+    Raises:
+        MeshError: unreadable, or something that the mesh names would replace a file that is there already.
+    """
+    stem = mesh.stem if stem is None else stem
+    if mesh.suffix.lower() in BREP_SUFFIXES:
+        (folder / f"{stem}.glb").write_bytes(glb_of_brep(mesh))
+        return f"{stem}.glb"
+    name = f"{stem}{mesh.suffix}"
+    copy_with_companions(mesh, companions_of(mesh), folder, name)
+    return name
+
+
 def _read(path: Path) -> tuple[trimesh.Scene, Companions]:
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
@@ -83,7 +107,8 @@ def _read(path: Path) -> tuple[trimesh.Scene, Companions]:
     size = path.stat().st_size
     if not 0 < size <= MAX_FILE_BYTES:
         raise MeshError(f"CAD model {path.name}: the file has {size} bytes, expected 1 to {MAX_FILE_BYTES}")
-    {".glb": _check_glb, ".ply": _check_ply, ".stl": _check_archive, ".obj": _check_archive}[suffix](path)
+    checks = {".glb": _check_glb, ".ply": _check_ply}
+    checks.get(suffix, _check_archive)(path)
     source: Path | io.BytesIO = path
     libraries: list[str] = []
     if suffix == ".obj":
@@ -91,10 +116,13 @@ def _read(path: Path) -> tuple[trimesh.Scene, Companions]:
         source, libraries = io.BytesIO(text), material_libraries(text)
     elif suffix == ".stl":
         source = io.BytesIO(_stl_of_declared_size(path))
+    elif suffix in BREP_SUFFIXES:
+        source = io.BytesIO(glb_of_brep(path))
     files = Companions(path, libraries)
+    file_type = "glb" if suffix in BREP_SUFFIXES else suffix[1:]
     try:
         with _silent_trimesh():
-            scene = trimesh.load_scene(source, file_type=suffix[1:], resolver=files, process=False)
+            scene = trimesh.load_scene(source, file_type=file_type, resolver=files, process=False)
     except Exception as error:  # parsers raise whatever the broken bytes lead them to
         raise MeshError(
             f"CAD model {path.name}: not a readable {suffix[1:]} file ({type(error).__name__}: {_short(error)})"
@@ -144,7 +172,7 @@ def _check_scene(scene: trimesh.Scene, name: str) -> None:
 
 
 def _check_archive(path: Path) -> None:
-    """OBJ and STL declare little: refuse archives in disguise."""
+    """Formats that declare little: refuse archives in disguise."""
     with path.open("rb") as file:
         head = file.read(4)
     if head in (b"PK\x03\x04", b"\x1f\x8b\x08\x00", b"7z\xbc\xaf") or head[:2] == b"\x1f\x8b":

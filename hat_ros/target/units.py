@@ -1,4 +1,4 @@
-"""The unit of a CAD file. No format but glTF says it; a wrong one gives a range that is wrong by the same factor."""
+"""The unit of a CAD file. Of meshes, only glTF says it; a wrong one gives a range that is wrong by the same factor."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from hat_ros.target.brep import BREP_SUFFIXES
 from hat_ros.target.companions import say_once
 
 AUTO = "auto"
@@ -21,14 +22,15 @@ _USUAL_M = (0.03, 30.0)
 def guess_unit_scale(scene: trimesh.Scene, path: Path) -> float:
     """Metres per unit of a file, and one sentence that says it.
 
-    A glTF is in metres by definition. Of the other formats nothing is known: metres if the size is that of a
-    spacecraft, else centimetres or millimetres, whichever comes nearest to a spacecraft of usual size.
+    A glTF is in metres by definition, and STEP and IGES are made so by their own unit. Of the other formats nothing is
+    known: metres if the size is that of a spacecraft, else centimetres or millimetres, whichever comes nearest to a
+    spacecraft of usual size.
 
     Args:
         scene: the file's content.
         path: the file.
     """
-    if path.suffix.lower() == ".glb":
+    if path.suffix.lower() in (".glb", *BREP_SUFFIXES):
         return 1.0
     extent = extent_of(scene)
     low, high = SPACECRAFT_M

@@ -130,3 +130,19 @@ def test_texture_bombs_are_refused_before_they_are_unpacked():
     )
     with pytest.raises(MeshError, match="9000x9000 px"):
         target_from_scene(trimesh.Scene(mesh), "bomb")
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("seed", range(5))
+def test_corners_in_a_line_are_dropped_however_they_round(seed):
+    rng = np.random.default_rng(seed)
+    good = box().triangles
+    a, step = rng.uniform(-0.4, 0.4, (200, 3)), rng.uniform(-0.3, 0.3, (200, 3))
+    lines = np.stack([a, a + step, a + 2 * step], axis=1)
+    lines[100:, :, 1:] = lines[100:, :1, 1:]  # along an axis: their area is zero in floating point too
+    corners = np.concatenate([good, lines])
+    mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
+    target = target_from_scene(trimesh.Scene(mesh), f"lines{seed}")
+    assert np.isfinite(target.face_normals).all() and (target.face_areas_m2 > 0).all()
+    assert len(np.unique(target.faces)) == len(target.vertices_m)
+    np.testing.assert_allclose(target.face_areas_m2.sum(), 22.0, atol=1e-6)

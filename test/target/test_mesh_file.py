@@ -62,7 +62,7 @@ def test_missing_file(tmp_path):
         load_target(tmp_path / "gone.ply")
 
 
-@pytest.mark.parametrize("name", ["model.step", "model.zip", "model.gltf", "model"])
+@pytest.mark.parametrize("name", ["model.fbx", "model.zip", "model.gltf", "model"])
 def test_other_formats_are_refused(tmp_path, name):
     (tmp_path / name).write_bytes(b"whatever")
     with pytest.raises(MeshError, match="not supported"):

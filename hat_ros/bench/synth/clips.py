@@ -17,8 +17,7 @@ from hat_ros.bench.synth.backdrop import Earth, EarthView, Table, stars
 from hat_ros.bench.synth.sunlit import Light, SunlitRenderer
 from hat_ros.errors import UsageError
 from hat_ros.geometry import lie
-from hat_ros.target.companions import copy_with_companions
-from hat_ros.target.mesh_file import companions_of
+from hat_ros.target.mesh_file import copy_model
 from hat_ros.target.model import Target
 from hat_ros.target.srgb import srgb_from_linear
 from hat_ros.types import Camera
@@ -250,8 +249,7 @@ def write_clip(
         cv2.imwrite(str(partial / "masks" / f"{index:06d}.png"), frame.mask.astype(np.uint8) * 255)
         if progress is not None:
             progress(index + 1, spec.frames)
-    mesh = f"target{model.suffix}"
-    copy_with_companions(model, companions_of(model), partial, mesh)
+    mesh = copy_model(model, partial, "target")
     write_labels(partial, spec.camera, mesh, spec.kind, np.array(truth), names, unit_scale)
     partial.rename(out)
     return out
