@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
@@ -94,7 +94,7 @@ class SourceSpec:
             InputError: it is malformed, or no CAD model lies beside it.
         """
         if self.dataset:
-            return _source_of_images(self.path, self._in_dataset())
+            return _source_of_images(self.path, self._in_dataset(), camera_config)
         return open_source(self.path, self.detections, camera_config)
 
     def _in_dataset(self) -> ImageRecording:
@@ -122,7 +122,7 @@ class Source:
         stop, recording = None if limit is None else start + limit, self.recording
         if isinstance(recording, BagReader):
             return _attempts(recording, masks, start, stop)
-        return islice(recording.frames(stop, masks), start, stop)
+        return recording.frames(stop, masks, start)
 
     def masks(self, start: int = 0, limit: int | None = None) -> Iterator[tuple[int, UInt8 | None]]:
         """Stamps and recorded masks of the same frames, images left alone."""
@@ -177,7 +177,9 @@ def open_source(path: str | Path, detections: Path | None = None, camera_config:
         raise UsageError(f"recording {path}: no such file or folder")
     if (path / "labels.json").is_file():
         recording = load_sequence(path)
-        return _source_of_images(path, recording if detections is None else with_detections(recording, detections))
+        return _source_of_images(
+            path, recording if detections is None else with_detections(recording, detections), camera_config
+        )
     if path.suffix != ".mcap" and not (path / "metadata.yaml").is_file():
         raise UsageError(f"recording {path}: neither a bag (metadata.yaml) nor a sequence folder (labels.json)")
     if detections is not None:
@@ -188,5 +190,7 @@ def open_source(path: str | Path, detections: Path | None = None, camera_config:
     return Source(path, bag, load_target(bag.target_path))
 
 
-def _source_of_images(path: Path, recording: ImageRecording) -> Source:
+def _source_of_images(path: Path, recording: ImageRecording, camera_config: CameraConfig | None) -> Source:
+    if camera_config is not None:
+        recording = replace(recording, image_depth=camera_config.image_depth)
     return Source(path, recording, load_target(recording.target_path, recording.unit_scale))

@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from hat_ros.array_types import Float, Float32, UInt8
 from hat_ros.errors import DatasetError, FrameError
 from hat_ros.geometry import lie
+from hat_ros.io.value_range import ValueRange
 from hat_ros.types import Camera, Frame
 
 if TYPE_CHECKING:
@@ -58,6 +60,7 @@ class ImageRecording:
             boxes do not count.
         mask_value: grey level of the target in the files' masks; None = all above 127.
         scene: (scene, object) numbers of a BOP data set, by which detections of many are told apart.
+        image_depth: option ``camera.image_depth``, for 16-bit files.
     """
 
     name: str
@@ -69,23 +72,24 @@ class ImageRecording:
     detections: DetectionLookup | None = None
     scene: tuple[int, int] | None = None
     mask_value: int | None = None
+    image_depth: str = "auto"
 
     def __len__(self) -> int:
         return len(self.files)
 
-    def frames(self, limit: int | None = None, masks: bool = True) -> Iterator[Frame]:
+    def frames(self, limit: int | None = None, masks: bool = True, start: int = 0) -> Iterator[Frame]:
         """Decoded frames in order, with or without what is known of the target's place in them.
+
+        The depth of 16-bit files is found as for a bag: it grows from frame to frame.
 
         Raises:
             DatasetError: a file is missing, cannot be decoded, or has another size than the calibration says.
         """
-        for item in self.files[:limit]:
-            yield self.frame(item, masks)
-
-    def frame(self, item: ImageFile, mask: bool = True) -> Frame:
-        """Decode one frame; errors as in :meth:`frames`."""
-        rgb = self._rectify(read_rgb(item.image), item.image, cv2.INTER_LINEAR)
-        return Frame(item.stamp_ns, rgb, self.camera, self.given_mask(item) if mask else None)
+        known = ValueRange.of_option(self.image_depth)
+        for item in self.files[start:limit]:
+            rgb, known = read_rgb(item.image, known)
+            rectified = self._rectify(rgb, item.image, cv2.INTER_LINEAR)
+            yield Frame(item.stamp_ns, rectified, self.camera, self.given_mask(item) if masks else None)
 
     def given_mask(self, item: ImageFile) -> UInt8 | None:
         """(H, W) uint8 as in ``Frame.given_mask``, None when the frame brings no detection at all."""
@@ -128,16 +132,26 @@ class ImageRecording:
         return np.asarray(cv2.remap(image, *self._maps, interpolation), np.uint8)
 
 
-def read_rgb(path: Path) -> UInt8:
-    """(H, W, 3) uint8 RGB of an image file; grey is repeated.
+def read_rgb(path: Path, known: ValueRange) -> tuple[UInt8, ValueRange]:
+    """(H, W, 3) uint8 RGB of an image file, grey repeated, and what is known of its range of values after it.
 
     Raises:
-        DatasetError: missing or not an image.
+        DatasetError: missing, not an image, or of other than 8 or 16 bits per value.
     """
-    return np.asarray(cv2.cvtColor(_read(path, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), np.uint8)
+    bgr = _decoded(path, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if bgr.dtype == np.uint16:
+        bgr, known = known.narrow(bgr.astype(np.uint16, copy=False))
+    if bgr.dtype != np.uint8:
+        raise DatasetError(f"{path}: an image must have 8 or 16 bits per value, found {bgr.dtype}")
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8), known
 
 
 def _read(path: Path, flags: int) -> UInt8:
+    """An image file in 8 bits."""
+    return np.asarray(_decoded(path, flags), np.uint8)
+
+
+def _decoded(path: Path, flags: int) -> NDArray[np.generic]:
     try:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError as error:
@@ -146,7 +160,7 @@ def _read(path: Path, flags: int) -> UInt8:
     image = cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
     if image is None:
         raise DatasetError(f"{path}: not an image that can be decoded; copy the data set again")
-    return np.asarray(image, np.uint8)
+    return np.asarray(image)
 
 
 def pose_from_label(quat: object, translation_m: object, order: str, where: str) -> Float:

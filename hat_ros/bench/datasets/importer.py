@@ -23,6 +23,7 @@ from hat_ros.io.provenance import input_hash
 from hat_ros.target.loading import find_model, load_target
 from hat_ros.target.mesh_file import companions_of
 from hat_ros.target.rendering import create_renderer
+from hat_ros.types import Frame
 
 LOG = logging.getLogger(__name__)
 
@@ -180,10 +181,11 @@ def _write_bag(recording: ImageRecording, bag: Path, made_from: dict[str, Any], 
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     with BagWriter(partial / bag.name, image_format="png") as writer:
-        for index, item in enumerate(recording.files):
+        # Decoding also proves that every file can be read and has the right size.
+        for index, (item, frame) in enumerate(zip(recording.files, recording.frames(masks=False), strict=True)):
             writer.write_frame(
                 item.stamp_ns,
-                _image(recording, item),
+                _image(recording, item, frame),
                 recording.camera,
                 mask=recording.given_mask(item),
                 T_cam_target=item.T_cam_target,
@@ -200,9 +202,8 @@ def _write_bag(recording: ImageRecording, bag: Path, made_from: dict[str, Any], 
     partial.rmdir()
 
 
-def _image(recording: ImageRecording, item: ImageFile) -> bytes | UInt8:
+def _image(recording: ImageRecording, item: ImageFile, frame: Frame) -> bytes | UInt8:
     """The file's own bytes where nothing has to change, else undistorted pixels (stored without loss)."""
-    frame = recording.frame(item)  # also proves that the file can be decoded and has the right size
     if recording.distortion.any() or item.image.suffix.lower() not in (".jpg", ".jpeg", ".png"):
         return frame.rgb
     return item.image.read_bytes()
@@ -279,7 +280,7 @@ def check_picture(recording: ImageRecording, width_px: int = 640) -> UInt8:
     renderer = create_renderer("rays", load_target(recording.target_path, recording.unit_scale))
     columns = []
     for item, T_cam_target in (labelled[0], labelled[len(labelled) // 2], labelled[-1]):
-        rgb = recording.frame(item).rgb.copy()
+        rgb = next(replace(recording, files=[item]).frames(masks=False)).rgb.copy()
         view = renderer.render(T_cam_target, recording.camera)
         contours, _ = cv2.findContours(view.mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(rgb, contours, -1, (0, 255, 0), max(1, rgb.shape[1] // 640))

@@ -831,3 +831,32 @@ def test_bad_ycb_video(ycb_root, tmp_path):
     (frames / "000002-meta.mat").write_bytes(b"MATLAB 5.0 MAT-file" + bytes(200))
     with pytest.raises(DatasetError, match="not a MATLAB file"):
         list(open_dataset("ycb_video", ycb_root))
+
+
+@pytest.mark.parametrize("bits", [10, 12, 16])
+@pytest.mark.parametrize("extension", ["png", "tiff"])
+def test_files_of_16_bits_are_read_by_their_depth_in_place_as_from_the_bag(sequence, tmp_path, bits, extension):
+    names = [f"wide{index}.{extension}" for index in range(3)]
+    for index, name in enumerate(names):
+        picture = image(index)
+        picture[0, 0] = 255
+        # The first frame is dark: by itself it could be one of fewer bits.
+        save(sequence / "images" / name, (picture // (1 if index else 8)).astype(np.uint16) << (bits - 8))
+    write_labels(sequence, CAMERA, "target.ply", "test", POSES, names)
+    recording = load_sequence(sequence)
+    frames = list(recording.frames())
+    for index in (1, 2):
+        assert np.array_equal(frames[index].rgb[1:], image(index)[1:])
+    (bag,) = import_dataset("sequence", sequence, tmp_path / "bag")
+    for here, there in zip(frames, BagReader(bag).frames(), strict=True):
+        assert np.array_equal(here.rgb, there.rgb)
+    assert [frame.stamp_ns for frame in recording.frames(start=1)] == [stamp_of(1), stamp_of(2)]
+    told = replace(recording, image_depth="16")
+    assert np.array_equal(next(told.frames(start=1)).rgb[1:], image(1)[1:] >> (16 - bits))
+
+
+def test_files_of_real_numbers_are_refused(sequence):
+    save(sequence / "images" / "real.tiff", image(0).astype(np.float32))
+    write_labels(sequence, CAMERA, "target.ply", "test", POSES[:1], ["real.tiff"])
+    with pytest.raises(DatasetError, match=r"real\.tiff: an image must have 8 or 16 bits per value, found float32"):
+        next(load_sequence(sequence).frames())
