@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import json
+import struct
 import subprocess
 import sys
 import tempfile
@@ -20,6 +22,7 @@ from hat_ros.errors import MeshError, MissingDependencyError
 
 BREP_SUFFIXES = (".step", ".stp", ".iges", ".igs")
 _TIMEOUT_S = 900
+_JSON = 0x4E4F534A  # type of the first chunk of a GLB
 # Chords deviate by at most a tenth of a millimetre, or 0.2 rad of a curve.
 _SCRIPT = """
 import sys, cascadio
@@ -43,7 +46,7 @@ def glb_of_brep(path: Path) -> bytes:
             f"CAD model {path.name}: STEP and IGES are read by the package 'cascadio', which is not installed: "
             f"`pip install cascadio`, or export the model as glb"
         )
-    key = f"1 {path.suffix.lower()} {hashlib.sha256(path.read_bytes()).hexdigest()}"
+    key = f"2 {path.suffix.lower()} {hashlib.sha256(path.read_bytes()).hexdigest()}"
     arrays = cached_arrays("brep", key, lambda: {"glb": np.frombuffer(_converted(path), np.uint8)})
     return arrays["glb"].tobytes()
 
@@ -61,4 +64,16 @@ def _converted(path: Path) -> bytes:
     # A file without shapes becomes a glTF without meshes.
     if b'"meshes"' not in data:
         raise MeshError(f"CAD model {path.name}: OpenCASCADE finds no shape in this {kind.upper()} file")
-    return data
+    return _in_metres(data) if kind == "iges" else data
+
+
+def _in_metres(glb: bytes) -> bytes:
+    """The same file under a node that scales by 0.001: of IGES, ``cascadio`` writes millimetres whatever its unit."""
+    (length,) = struct.unpack("<I", glb[12:16])
+    tree, rest = json.loads(glb[20 : 20 + length]), glb[20 + length :]
+    for scene in tree["scenes"]:
+        tree["nodes"].append({"scale": [1e-3] * 3, "children": scene["nodes"]})
+        scene["nodes"] = [len(tree["nodes"]) - 1]
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    return glb[:8] + struct.pack("<III", 20 + len(text) + len(rest), len(text), _JSON) + text + rest
