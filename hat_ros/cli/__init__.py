@@ -1,20 +1,25 @@
 """The command line ``hat``. One file per group of commands; heavy imports happen inside the commands.
 
-Exit codes: 0 done, 1 the run failed, 2 bad input, 130 stopped by Ctrl-C. An error that the user can put right is one
-sentence on stderr; a traceback is a bug.
+Exit codes: 0 done, 1 the run failed, 2 bad input, 130 stopped by Ctrl-C, 143 by SIGTERM. An error that the user can put
+right is one sentence on stderr; a traceback is a bug.
 """
 
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
 
 from hat_ros import __version__
 from hat_ros.cli import analyse, bench, config, data, run, system
 from hat_ros.errors import HatError, InputError
 
 EXIT_INTERRUPTED = 130
+EXIT_TERMINATED = 143
 
 _EPILOG = """\
 examples:
@@ -40,11 +45,34 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM, taken as Ctrl-C is: what was done is kept, and child processes are ended."""
+
+
+@contextmanager
+def _sigterm_interrupts() -> Iterator[None]:
+    """Within, the first SIGTERM raises :class:`_Terminated`, and later ones do not disturb the tidying up."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        raise _Terminated
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     parsed = build_parser().parse_args(arguments)
     try:
-        return parsed.command(parsed) or 0
+        with _sigterm_interrupts():
+            return parsed.command(parsed) or 0
     except HatError as error:
         print(f"hat: {' '.join(str(error).split())}", file=sys.stderr)
         return error.exit_code
@@ -53,12 +81,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print(f"hat: the package '{error.name}' is missing: run `make install` or `pip install .`", file=sys.stderr)
         return InputError.exit_code
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
+        terminated = isinstance(error, _Terminated)
         print(
-            "hat: stopped by Ctrl-C; what was done is in the .partial folder, if the command had begun one",
+            f"hat: stopped by {'SIGTERM' if terminated else 'Ctrl-C'}; what was done is in the .partial folder, if the "
+            f"command had begun one",
             file=sys.stderr,
         )
-        return EXIT_INTERRUPTED
+        return EXIT_TERMINATED if terminated else EXIT_INTERRUPTED
     except BrokenPipeError:  # `hat ... | head`
         sys.stderr.close()
         return 1

@@ -168,7 +168,9 @@ def _bench(arguments: argparse.Namespace) -> int:
     from hat_ros.bench.experiments.comparison_figure import bench_figure
     from hat_ros.bench.experiments.run_matrix import run_jobs
     from hat_ros.cli.console import matrix_progress
+    from hat_ros.io.own_folder import checked_out
 
+    out = checked_out(arguments.out).resolve()
     methods = [comparison.Entry.parse(text, arguments.config) for text in arguments.methods]
     jobs = comparison.bench_jobs(
         _clips(arguments),
@@ -181,7 +183,6 @@ def _bench(arguments: argparse.Namespace) -> int:
         dict(arguments.poses),
         methods,
     )
-    out = arguments.out.resolve()
     with matrix_progress(len(jobs)) as watch:
         outcomes = run_jobs(jobs, out, arguments.jobs, watch)
     table, stages, groups = (
@@ -239,9 +240,10 @@ def _ablate(arguments: argparse.Namespace) -> int:
     from hat_ros.bench.experiments.ablation_figure import table_figure
     from hat_ros.bench.experiments.run_matrix import run_jobs
     from hat_ros.cli.console import matrix_progress
+    from hat_ros.io.own_folder import checked_out
     from hat_ros.io.results import write_json
 
-    out = arguments.out.resolve()
+    out = checked_out(arguments.out).resolve()
     plan = ablation.plan(
         _clips(arguments), out, arguments.config, arguments.front_end, arguments.overrides, arguments.limit
     )

@@ -10,6 +10,7 @@ run.json        where it came from: command, commit, versions, input hashes
 metrics.json    figures: errors, coverage, speed
 report.html     plots, overlay frames, table; one file, no network
 overlay.mp4     the clip with the CAD outline drawn in
+.hat_ros        says that the folder is ours and may be replaced
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -29,7 +29,8 @@ import yaml
 
 from hat_ros.array_types import Float
 from hat_ros.config import HatConfig, config_to_dict
-from hat_ros.errors import RunError, UsageError
+from hat_ros.errors import UsageError
+from hat_ros.io import own_folder
 from hat_ros.types import Estimate
 
 BAG_FOLDER = "bag"
@@ -49,20 +50,25 @@ class ResultFolder:
         overwrite: replace a finished folder that is there already.
 
     Raises:
-        UsageError: the folder exists and ``overwrite`` is false, or it is no result folder of ours.
+        UsageError: the folder exists and ``overwrite`` is false, it is no folder of ours, another command is writing
+            there, or ``path`` is no place for a new folder.
         RunError: it cannot be created.
     """
 
     def __init__(self, path: str | Path, overwrite: bool = False) -> None:
-        self.final_path = Path(path)
+        self.final_path = own_folder.checked_out(path)
         self.path = self.final_path.with_name(self.final_path.name + ".partial")
+        self._stack = ExitStack()
         self._overwrite = overwrite
-        if self.final_path.exists():
-            if not overwrite:
-                raise UsageError(f"--out {self.final_path} exists already: choose another folder or add --overwrite")
-            _check_ours(self.final_path)
+        self._check_replaceable()
         if self.path.exists():
-            _check_ours(self.path)
+            own_folder.require_ours(self.path)
+
+    def _check_replaceable(self) -> None:
+        if self.final_path.exists():
+            if not self._overwrite:
+                raise UsageError(f"--out {self.final_path} exists already: choose another folder or add --overwrite")
+            own_folder.require_ours(self.final_path)
 
     @property
     def bag_path(self) -> Path:
@@ -70,28 +76,17 @@ class ResultFolder:
         return self.path / BAG_FOLDER
 
     def __enter__(self) -> ResultFolder:
-        try:
-            if self.path.exists():  # left by a run that was stopped; this one replaces it
-                shutil.rmtree(self.path)
-            self.path.mkdir(parents=True)
-        except OSError as error:
-            raise RunError(f"cannot create {self.path}: {error.strerror}") from None
+        self._stack.enter_context(own_folder.NewFolder(self.path))  # what a run that was stopped left is replaced
+        self._check_replaceable()  # another run may have finished since
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is not None:
-            return
-        if self.final_path.exists():
-            shutil.rmtree(self.final_path)
-        self.path.rename(self.final_path)
-
-
-def _check_ours(path: Path) -> None:
-    """Refuse to delete a folder that no run has made."""
-    if not path.is_dir() or (any(path.iterdir()) and not (path / CONFIG_FILE).is_file()):
-        raise UsageError(f"{path} exists and is not a result folder: choose another --out")
+        with self._stack:
+            if kind is None:
+                own_folder.remove(self.final_path)
+                self.path.rename(self.final_path)
 
 
 def write_config(path: Path, config: HatConfig) -> None:

@@ -1,9 +1,12 @@
 """The command line: exit codes, one sentence, no traceback, true help, light start."""
 
 import json
+import os
 import re
+import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -83,7 +86,7 @@ BAD_INPUT = [
     (["track", "{bag}", "--out", "{tmp}/out", "--config", "nope"], "no configuration 'nope'"),
     (["track", "{bag}", "--out", "{tmp}/out", "--config", "{settings}", "--set", "keyframes.gap=1"], "gap_frames"),
     (["track", "{bag}", "--out", "{tmp}/out", "--config", "{settings}", "--set", "keyframes"], "section.key=value"),
-    (["track", "{bag}", "--out", "{bag}", "--overwrite"], "not a result folder"),
+    (["track", "{bag}", "--out", "{bag}", "--overwrite"], "not a folder that hat has made"),
     (["track", "{bag}", "--out", "{tmp}/out", "--config", "{settings}", "--start", "10"], "leaves none"),
     (["replay", "{tmp}/none", "--out", "{tmp}/out", "--config", "{settings}"], "no such file"),
     (["temporal", "{tmp}/none.npz", "--out", "{tmp}/o.npz", "--config", "{settings}"], "no such file"),
@@ -201,6 +204,24 @@ def test_track_the_same_twice_gives_the_same_bytes(scripted, bag, settings, tmp_
         main(["track", str(bag), "--out", str(tmp_path / name), *options])
     for file in ("poses.tum", "poses.csv", "config.yaml"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+def test_sigterm_keeps_what_was_done_as_ctrl_c_does(monkeypatch, bag, settings, tmp_path, capsys):
+    class Ends(ScriptedMethod):
+        def step(self, seen):
+            if seen.stamp_ns == stamp(6):
+                os.kill(os.getpid(), signal.SIGTERM)
+                os.kill(os.getpid(), signal.SIGTERM)
+                time.sleep(0.5)
+            return super().step(seen)
+
+    monkeypatch.setattr("hat_ros.bench.runs.track.create_method", lambda *_: Ends())
+    before = signal.getsignal(signal.SIGTERM)
+    code = main(["track", str(bag), "--out", str(tmp_path / "out"), "--config", settings, "--quiet"])
+    assert code == 143 and "stopped by SIGTERM" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGTERM) == before
+    assert json.loads((tmp_path / "out.partial" / "metrics.json").read_text())["frames"] >= 1
+    assert main(["track", str(bag), "--out", str(tmp_path / "out"), "--config", settings, "--quiet"]) == 143, "replaced"
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device")])

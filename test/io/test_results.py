@@ -7,6 +7,7 @@ from scripted import CAMERA, steps, true_row, truth
 
 from hat_ros.config import HatConfig, config_from_dict
 from hat_ros.errors import BagError, UsageError
+from hat_ros.io.own_folder import MARKER
 from hat_ros.io.result_bag import ResultBagWriter, read_result_bag
 from hat_ros.io.results import LiveTables, ResultFolder, tum_line, write_config
 from hat_ros.io.run_log import RunLogBuilder
@@ -94,7 +95,7 @@ def test_next_run_replaces_the_partial_of_a_stopped_one(tmp_path):
         write_config(folder.path, HatConfig())
         raise KeyboardInterrupt
     with ResultFolder(tmp_path / "out") as folder:
-        assert list(folder.path.iterdir()) == []
+        assert [path.name for path in folder.path.iterdir()] == [MARKER]
         write_config(folder.path, HatConfig())
     assert (tmp_path / "out").is_dir()
 
@@ -108,14 +109,36 @@ def test_finished_result_is_not_overwritten_unasked(tmp_path):
             write_config(folder.path, HatConfig())
 
 
-def test_overwrite_never_deletes_what_is_no_result_folder(tmp_path):
-    (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / "cat.jpg").write_bytes(b"x")
-    with pytest.raises(UsageError, match="not a result folder"):
+@pytest.mark.parametrize("name", ["photos", "photos.partial"])
+@pytest.mark.parametrize("holds", ["cat.jpg", "config.yaml", "run.json", "metadata.yaml", MARKER])
+def test_overwrite_never_deletes_what_we_have_not_made(tmp_path, name, holds):
+    (tmp_path / name).mkdir()
+    (tmp_path / name / holds).write_text("x")
+    with pytest.raises(UsageError, match="not a folder that hat has made"):
         ResultFolder(tmp_path / "photos", overwrite=True)
+    assert (tmp_path / name / holds).read_text() == "x"
+
+
+def test_what_is_no_place_for_a_result_is_refused(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("x")
-    with pytest.raises(UsageError, match="not a result folder"):
-        ResultFolder(tmp_path / "file", overwrite=True)
+    (tmp_path / "here" / "deep").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "here")
+    for path in ("", ".", "..", "/", "deep/..", str(tmp_path), str(tmp_path / "file"), str(tmp_path / "file" / "out")):
+        with pytest.raises(UsageError, match="--out"):
+            ResultFolder(path, overwrite=True)
+    assert (tmp_path / "file").read_text() == "x" and (tmp_path / "here" / "deep").is_dir()
+
+
+def test_a_second_run_into_the_same_folder_is_refused_until_the_first_has_ended(tmp_path):
+    with ResultFolder(tmp_path / "out") as first:
+        write_config(first.path, HatConfig())
+        with pytest.raises(UsageError, match="another command is writing"), ResultFolder(tmp_path / "out"):
+            raise AssertionError
+        assert (first.path / "config.yaml").is_file()
+        late = ResultFolder(tmp_path / "out")
+    with pytest.raises(UsageError, match="--overwrite"), late:
+        raise AssertionError
+    assert (tmp_path / "out" / "config.yaml").is_file()
 
 
 def test_old_result_stays_until_the_new_one_is_complete(tmp_path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from importlib import import_module
@@ -18,6 +17,7 @@ from hat_ros.array_types import UInt8
 from hat_ros.bench.datasets.detections import load_detections
 from hat_ros.bench.datasets.image_files import ImageFile, ImageRecording
 from hat_ros.errors import DatasetError, UsageError
+from hat_ros.io import own_folder
 from hat_ros.io.bag_writer import BagWriter
 from hat_ros.io.provenance import input_hash
 from hat_ros.target.loading import find_model, load_target
@@ -113,7 +113,7 @@ def import_dataset(
     """
     if boxes and detections is not None:
         raise UsageError("boxes from the labels and detections from elsewhere exclude each other, choose one")
-    out, bags = Path(out), []
+    out, bags = own_folder.checked_out(out), []
     recordings: Iterable[ImageRecording] = open_dataset(fmt, root, model, sequences)
     found: dict[str, Path] = {}
     if detections is not None:  # which of them belong to a sequence depends on how many there are
@@ -178,9 +178,16 @@ def _write_bag(recording: ImageRecording, bag: Path, made_from: dict[str, Any], 
     """Write beside the goal and rename, so that a bag under its own name is always complete."""
     load_target(recording.target_path, recording.unit_scale)  # a bad CAD model is found before the long part
     partial = bag.with_name(f"{bag.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    with BagWriter(partial / bag.name, image_format="png") as writer:
+    with own_folder.NewFolder(partial):
+        _fill(recording, partial / bag.name, made_from, progress)
+        own_folder.remove(bag)  # made from something else
+        (partial / bag.name).rename(bag)
+    own_folder.remove(partial)
+
+
+def _fill(recording: ImageRecording, bag: Path, made_from: dict[str, Any], progress: Progress | None) -> None:
+    """Write the whole bag."""
+    with BagWriter(bag, image_format="png") as writer:
         # Decoding also proves that every file can be read and has the right size.
         for index, (item, frame) in enumerate(zip(recording.files, recording.frames(masks=False), strict=True)):
             writer.write_frame(
@@ -195,11 +202,8 @@ def _write_bag(recording: ImageRecording, bag: Path, made_from: dict[str, Any], 
         model = find_model(recording.target_path, recording.unit_scale)
         writer.write_target(model.mesh, model.unit_scale, recording.name)
         text = json.dumps(made_from, indent=2) + "\n"
-        (partial / bag.name / IMPORT_FILE).write_text(text, encoding="utf-8")
-    if bag.exists():  # made from something else
-        shutil.rmtree(bag)
-    (partial / bag.name).rename(bag)
-    partial.rmdir()
+        (bag / IMPORT_FILE).write_text(text, encoding="utf-8")
+    own_folder.mark(bag)
 
 
 def _image(recording: ImageRecording, item: ImageFile, frame: Frame) -> bytes | UInt8:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from hat_ros.bench.synth.backdrop import Earth, EarthView, Table, stars
 from hat_ros.bench.synth.sunlit import Light, SunlitRenderer
 from hat_ros.errors import UsageError
 from hat_ros.geometry import lie
+from hat_ros.io import own_folder
 from hat_ros.target.mesh_file import copy_model
 from hat_ros.target.model import Target
 from hat_ros.target.srgb import srgb_from_linear
@@ -236,9 +236,10 @@ def write_clip(
     if out.exists():
         raise UsageError(f"{out} exists already; choose another name or remove it")
     partial = out.with_name(out.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
+    own_folder.remove(partial)
     for folder in ("images", "masks"):
         (partial / folder).mkdir(parents=True)
+    own_folder.mark(partial)
     suffix = "jpg" if spec.jpeg_quality else "png"
     options = [cv2.IMWRITE_JPEG_QUALITY, spec.jpeg_quality] if spec.jpeg_quality else []
     names, truth = [], []

@@ -6,7 +6,6 @@ those of the data sets; ranges are scaled to the size of our models, so that the
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from hat_ros.bench.synth.clips import ClipSpec, trajectory, write_clip
 from hat_ros.bench.synth.mismatch import Mismatch, apply_mismatch
 from hat_ros.bench.synth.models import write_model
 from hat_ros.errors import UsageError
+from hat_ros.io import own_folder
 from hat_ros.target.loading import find_model, load_target
 
 
@@ -122,13 +122,11 @@ def synthesize(clip: Clip, out: str | Path, as_bag: bool = True, progress: Progr
         UsageError: ``out`` exists.
         MeshError: the CAD file is bad.
     """
-    out = Path(out)
+    out = own_folder.checked_out(out)
     if out.exists():
         raise UsageError(f"{out} exists already; choose another name or remove it")
     work = out.with_name(f"{out.name}.work")
-    shutil.rmtree(work, ignore_errors=True)
-    work.mkdir(parents=True)
-    try:
+    with own_folder.NewFolder(work):
         model = find_model(_model_file(clip, work))
         target = load_target(model.mesh, model.unit_scale)
         seen = apply_mismatch(target, clip.mismatch)
@@ -140,8 +138,7 @@ def synthesize(clip: Clip, out: str | Path, as_bag: bool = True, progress: Progr
             import_dataset("sequence", folder, out)
         else:
             folder.rename(out)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
+    own_folder.remove(work)
     return out
 
 
@@ -159,10 +156,10 @@ def write_suite(
     Returns:
         The bags.
     """
-    bags = []
+    out, bags = own_folder.checked_out(out), []
     for group, names in SUITE.items():
         for name in names:
-            bag, clip = Path(out) / group / name, CLIPS[name].within(width_px)
+            bag, clip = out / group / name, CLIPS[name].within(width_px)
             if limit is not None:
                 clip = replace(clip, spec=replace(clip.spec, frames=min(limit, clip.spec.frames)))
             bags.append(bag if bag.exists() else synthesize(clip, bag, progress=progress))
