@@ -20,7 +20,8 @@ from hat_ros.errors import BagError, DatasetError, FrameError, UsageError
 from hat_ros.geometry import lie
 from hat_ros.io.bag_reader import BagReader
 from hat_ros.io.provenance import input_hash
-from hat_ros.target.loading import load_target
+from hat_ros.target.loading import find_model, load_target
+from hat_ros.target.mesh_file import companions_of
 from hat_ros.target.model import Target
 from hat_ros.types import Frame
 
@@ -65,7 +66,9 @@ class SourceSpec:
             digest.update(b"\0".join((str(item.stamp_ns).encode(), truth, box)))
             for path in (item.image, *item.masks):
                 digest.update(input_hash(path).encode())
-        digest.update(input_hash(recording.target_path).encode())
+        model = find_model(recording.target_path, recording.unit_scale)
+        for path in dict.fromkeys((recording.target_path, model.mesh, *companions_of(model.mesh).values())):
+            digest.update(input_hash(path).encode())
         return self._with_detections(digest.hexdigest())
 
     def _with_detections(self, rest: str) -> str:

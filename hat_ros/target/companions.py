@@ -22,6 +22,7 @@ LOG = logging.getLogger(__name__)
 MATERIAL_SUFFIX = ".mtl"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".tif", ".tiff", ".webp", ".gif")
 MAX_COMPANION_BYTES = 256 * 2**20
+MAX_TRIED_PX = 64 * 2**20
 
 # Options before the name of a texture in a material file: -s 1 1 1, -clamp on, ...
 _MAP_OPTION = re.compile(r"^-[a-z]+(?:\s+(?:on|off|[-+0-9.eE]+))*\s+(?=\S)")
@@ -133,9 +134,11 @@ def say_once(sentence: str, level: int = logging.WARNING) -> None:
 
 
 def _is_image(data: bytes) -> bool:
+    """Whether it decodes to its end; one that is too large to try passes, and is refused by its size."""
     try:
         with Image.open(io.BytesIO(data)) as image:
-            image.verify()
+            if image.size[0] * image.size[1] <= MAX_TRIED_PX:
+                image.load()
     except Exception:  # whatever the broken bytes lead the decoder to
         return False
     return True

@@ -245,7 +245,12 @@ def _material(material: Any) -> tuple[UInt8, UInt8 | None, float, float]:
             f"CAD model: a texture of {image.size[0]}x{image.size[1]} px is larger than the accepted "
             f"{MAX_SOURCE_TEXTURE_PX // 2**20} megapixels; scale it down"
         )
-    image = image.convert("RGB")
+    try:
+        image = image.convert("RGB")
+    except Exception as error:  # whatever the broken bytes lead the decoder to
+        raise MeshError(
+            f"CAD model: one of its textures cannot be decoded ({type(error).__name__}): export the model again"
+        ) from None
     if max(image.size) > MAX_TEXTURE_SIDE_PX:
         image.thumbnail((MAX_TEXTURE_SIDE_PX, MAX_TEXTURE_SIDE_PX))
     texture = np.array(image, dtype=np.uint8)

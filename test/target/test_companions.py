@@ -2,6 +2,7 @@
 
 import logging
 
+import numpy as np
 import pytest
 import trimesh
 from PIL import Image
@@ -79,13 +80,16 @@ def test_two_materials_in_two_files(tmp_path, said):
     assert said() == []
 
 
-@pytest.mark.parametrize("kind", ["gone", "up", "absolute", "drive", "link", "broken", "text"])
+@pytest.mark.parametrize("kind", ["gone", "up", "absolute", "drive", "link", "broken", "cut", "text"])
 def test_a_texture_that_is_not_used_is_one_sentence(tmp_path, said, kind):
     folder = tmp_path / "models"
     folder.mkdir()
     picture(tmp_path / "out.png")
     (folder / "notes.txt").write_text("no image")
     (folder / "broken.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(40))
+    noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
+    Image.fromarray(noise).save(folder / "cut.jpg")
+    (folder / "cut.jpg").write_bytes((folder / "cut.jpg").read_bytes()[:2000])
     (folder / "link.png").symlink_to(tmp_path / "out.png")
     named = {
         "gone": "gone.png",
@@ -94,6 +98,7 @@ def test_a_texture_that_is_not_used_is_one_sentence(tmp_path, said, kind):
         "drive": "C:\\maps\\out.png",
         "link": "link.png",
         "broken": "broken.png",
+        "cut": "cut.jpg",
         "text": "notes.txt",
     }[kind]
     mesh = obj(folder, f"quad_{kind}.obj", named)
@@ -130,3 +135,16 @@ def test_a_companion_never_replaces_a_file_of_the_bag(tmp_path):
     with pytest.raises(MeshError, match=r"m\.mtl.* is taken"):
         copy_with_companions(mesh, companions_of(mesh), tmp_path / "b", "quad.obj")
     assert (tmp_path / "b" / "m.mtl").read_text() == "mine"
+
+
+def test_a_damaged_texture_inside_a_glb_is_one_sentence(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
+    mesh = trimesh.creation.box()
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(noise))
+    mesh.visual = trimesh.visual.TextureVisuals(uv=np.full((8, 2), 0.5), material=material)
+    data = bytearray(trimesh.Scene(mesh).export(file_type="glb"))
+    at = data.index(b"IDAT") + 400
+    data[at : at + 5000] = bytes(5000)
+    (tmp_path / "bad.glb").write_bytes(data)
+    with pytest.raises(MeshError, match="one of its textures cannot be decoded"):
+        load_target(tmp_path / "bad.glb")

@@ -139,13 +139,15 @@ def import_dataset(
 
 def _made_from(fmt: str, recording: ImageRecording, boxes: bool, detections: Path | None) -> dict[str, Any]:
     """What decides a bag's content beside the data set's own images and labels."""
-    mesh = find_model(recording.target_path).mesh
-    companions = companions_of(mesh)
+    model = find_model(recording.target_path, recording.unit_scale)
+    companions = companions_of(model.mesh)
     return {
         "format": fmt,
         "sequence": recording.name,
-        "model_sha256": input_hash(mesh),
+        "model_sha256": input_hash(model.mesh),
         **({"companions_sha256": {name: input_hash(path) for name, path in companions.items()}} if companions else {}),
+        # Where a target.yaml states a scale of its own.
+        **({"unit_scale": model.unit_scale} if model.unit_scale != recording.unit_scale else {}),
         "boxes_from_labels": boxes,
         "detections": None if detections is None else detections.name,
         "detections_sha256": None if detections is None else input_hash(detections),

@@ -860,3 +860,15 @@ def test_files_of_real_numbers_are_refused(sequence):
     write_labels(sequence, CAMERA, "target.ply", "test", POSES[:1], ["real.tiff"])
     with pytest.raises(DatasetError, match=r"real\.tiff: an image must have 8 or 16 bits per value, found float32"):
         next(load_sequence(sequence).frames())
+
+
+def test_a_target_yaml_as_the_model_of_a_data_set(speed_root, tmp_path):
+    save_mesh(tmp_path / "tango.stl", (800.0, 700.0, 400.0))
+    yaml = tmp_path / "target.yaml"
+    for scale in (0.001, 0.002):
+        yaml.write_text(f"mesh: tango.stl\nunit_scale: {scale}\n")
+        bag = import_dataset("speed", speed_root, tmp_path / "out", model=yaml, sequences=["lightbox_test"])[0]
+        target = load_target(bag / "target.yaml")
+        assert np.ptp(target.vertices_m[:, 0]) == pytest.approx(800 * scale)
+    (recording,) = open_dataset("speed", speed_root, yaml, ["lightbox_test"])
+    assert load_target(recording.target_path, recording.unit_scale).sha256 == target.sha256
