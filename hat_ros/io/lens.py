@@ -25,6 +25,7 @@ MODELS: dict[str, tuple[str, int]] = {
 }
 _OPENCV_COUNTS = (4, 5, 8, 12, 14)
 _PROFILE_STEPS = 1024
+_LEAST_SEEN = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,14 +91,25 @@ class Lens:
 
     @cached_property
     def _maps(self) -> tuple[Float32, Float32]:
-        """Where each pixel comes from; -1 beyond the radius at which the polynomial turns back."""
+        """Where each pixel comes from; -1 beyond the radius at which the polynomial turns back.
+
+        Raises:
+            FrameError: less than half of the image has data.
+        """
         K, size = self.camera.K, (self.camera.width, self.camera.height)
         if self.model == EQUIDISTANT:
             x, y = cv2.fisheye.initUndistortRectifyMap(K, self.coefficients, np.eye(3), K, size, cv2.CV_32FC1)
         else:
             x, y = cv2.initUndistortRectifyMap(K, self.coefficients, None, K, size, cv2.CV_32FC1)
         map_x, map_y = np.asarray(x, np.float32), np.asarray(y, np.float32)
-        beyond = self._radii() > self._largest_radius()
+        radii, (width, height) = self._radii(), size
+        beyond = radii > self._largest_radius(float(radii.max()))
+        seen = (map_x >= 0) & (map_x <= width - 1) & (map_y >= 0) & (map_y <= height - 1) & ~beyond
+        if seen.mean() < _LEAST_SEEN:
+            raise FrameError(
+                f"camera_info.d = {self.coefficients.tolist()} is no lens of this image: more than half of the image "
+                f"without distortion has no data; calibrate the camera again"
+            )
         map_x[beyond] = map_y[beyond] = -1.0
         return map_x, map_y
 
@@ -108,11 +120,12 @@ class Lens:
         x = (np.arange(self.camera.width)[None, :] - K[0, 2] - K[0, 1] * y) / K[0, 0]
         return np.hypot(x, y)
 
-    def _largest_radius(self) -> float:
+    def _largest_radius(self, most: float) -> float:
         """Up to where the distorted radius grows with the true one: a polynomial beyond its data may turn back."""
-        radii = np.linspace(0.0, 1.01 * float(self._radii().max()), _PROFILE_STEPS)
-        distorted = self._distorted(radii)
-        turns = np.flatnonzero(np.diff(distorted) <= 0.0)
+        radii = np.linspace(0.0, 1.01 * most, _PROFILE_STEPS)
+        with np.errstate(all="ignore"):  # a polynomial that overflows turns there
+            grows = np.diff(self._distorted(radii)) > 0.0
+        turns = np.flatnonzero(~grows)
         return float(radii[turns[0]]) if len(turns) else float("inf")
 
     def _distorted(self, radii: Float) -> Float:

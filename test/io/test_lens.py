@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from camera_info import LENSES, K, distorted_points, info, smooth_picture, through_lens
 
+from hat_ros.errors import FrameError
 from hat_ros.io.calibration import calibration_from
 from hat_ros.io.lens import MODELS, Lens
 from hat_ros.types import Camera
@@ -69,3 +70,29 @@ def test_rays_stay_in_the_optical_frame(model):
     weight = found.astype(float)
     centre = (weight * u).sum() / weight.sum(), (weight * v).sum() / weight.sum()
     assert centre == pytest.approx((K @ [x, y, 1.0])[:2], abs=0.25)
+
+
+@pytest.mark.parametrize(
+    ("model", "d"),
+    [
+        ("plumb_bob", (-40.0, 0, 0, 0, 0)),
+        ("plumb_bob", (1e300, -1e300, 0, 0, 0)),
+        ("rational_polynomial", (0.0, 0, 0, 0, 0, 60.0, 0, 0)),
+        ("equidistant", (-30.0, 0, 0, 0)),
+    ],
+)
+def test_coefficients_that_are_no_lens_are_one_sentence(model, d):
+    lens = Lens.of(model, np.array(d), CAMERA)
+    with pytest.raises(FrameError, match="is no lens of this image"):
+        lens.undistort(smooth_picture())
+
+
+def test_any_coefficients_give_a_picture_or_a_sentence():
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        model = str(rng.choice(list(MODELS)))
+        d = rng.normal(size=4) * rng.choice([1e-3, 0.1, 3.0, 1e6])
+        try:
+            assert Lens.of(model, d, CAMERA).undistort(smooth_picture()).shape == (240, 320, 3)
+        except FrameError:
+            continue

@@ -143,7 +143,7 @@ def read_rgb(path: Path, known: ValueRange) -> tuple[UInt8, ValueRange]:
         bgr, known = known.narrow(bgr.astype(np.uint16, copy=False))
     if bgr.dtype != np.uint8:
         raise DatasetError(f"{path}: an image must have 8 or 16 bits per value, found {bgr.dtype}")
-    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8), known
+    return np.asarray(cv2.cvtColor(np.asarray(bgr, np.uint8), cv2.COLOR_BGR2RGB), np.uint8), known
 
 
 def _read(path: Path, flags: int) -> UInt8:
