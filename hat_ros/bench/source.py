@@ -18,6 +18,7 @@ from hat_ros.bench.datasets.sequence import load_sequence
 from hat_ros.config import CameraConfig
 from hat_ros.errors import BagError, DatasetError, FrameError, UsageError
 from hat_ros.geometry import lie
+from hat_ros.io.bag_files import is_bag
 from hat_ros.io.bag_reader import BagReader
 from hat_ros.io.provenance import input_hash
 from hat_ros.target.loading import find_model, load_target
@@ -36,6 +37,8 @@ class SourceSpec:
         sequence: name of the sequence within the data set.
         model: CAD model, for data sets that bring none.
         detections: masks or boxes of this sequence computed elsewhere, see ``datasets.importer.with_detections``.
+        image_topic: topic of the images in a bag; None = find it.
+        camera_info_topic: topic of the calibration in a bag; None = find it.
     """
 
     path: Path
@@ -43,6 +46,8 @@ class SourceSpec:
     sequence: str = ""
     model: Path | None = None
     detections: Path | None = None
+    image_topic: str | None = None
+    camera_info_topic: str | None = None
 
     @property
     def name(self) -> str:
@@ -84,6 +89,8 @@ class SourceSpec:
             "model": None if self.model is None else str(self.model.resolve()),
             "detections": None if self.detections is None else str(self.detections.resolve()),
             "detections_sha256": None if self.detections is None else input_hash(self.detections),
+            "image_topic": self.image_topic,
+            "camera_info_topic": self.camera_info_topic,
         }
 
     def open(self, camera_config: CameraConfig | None = None) -> Source:
@@ -98,7 +105,13 @@ class SourceSpec:
         """
         if self.dataset:
             return _source_of_images(self.path, self._in_dataset(), camera_config)
-        return open_source(self.path, self.detections, camera_config)
+        return open_source(
+            self.path,
+            self.detections,
+            camera_config,
+            image_topic=self.image_topic,
+            camera_info_topic=self.camera_info_topic,
+        )
 
     def _in_dataset(self) -> ImageRecording:
         for recording in open_dataset(self.dataset, self.path, self.model, (self.sequence,)):
@@ -173,7 +186,14 @@ def _masks(bag: BagReader) -> Iterator[tuple[int, UInt8 | None]]:
         yield packet.stamp_ns, mask
 
 
-def open_source(path: str | Path, detections: Path | None = None, camera_config: CameraConfig | None = None) -> Source:
+def open_source(
+    path: str | Path,
+    detections: Path | None = None,
+    camera_config: CameraConfig | None = None,
+    *,
+    image_topic: str | None = None,
+    camera_info_topic: str | None = None,
+) -> Source:
     """Open a bag or a folder of the ``sequence`` layout, and the CAD model beside it; see :meth:`SourceSpec.open`."""
     path = Path(path)
     if not path.exists():
@@ -183,11 +203,13 @@ def open_source(path: str | Path, detections: Path | None = None, camera_config:
         return _source_of_images(
             path, recording if detections is None else with_detections(recording, detections), camera_config
         )
-    if path.suffix != ".mcap" and not (path / "metadata.yaml").is_file():
-        raise UsageError(f"recording {path}: neither a bag (metadata.yaml) nor a sequence folder (labels.json)")
+    if not is_bag(path):
+        raise UsageError(
+            f"recording {path}: neither a bag (metadata.yaml, .mcap or .db3) nor a sequence folder (labels.json)"
+        )
     if detections is not None:
         raise UsageError(f"recording {path}: a bag has its detections in it; give --detections to `hat import`")
-    bag = BagReader(path, camera_config=camera_config)
+    bag = BagReader(path, image_topic=image_topic, camera_info_topic=camera_info_topic, camera_config=camera_config)
     if bag.target_path is None:
         raise BagError(f"{path} has no target.yaml: put the CAD model and a target.yaml that names it into the folder")
     return Source(path, bag, load_target(bag.target_path))

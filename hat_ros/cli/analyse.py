@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hat_ros.cli.options import Commands, add_camera, add_dataset, add_extent, add_out, extent_of, spec_of
+from hat_ros.cli.options import Commands, add_camera, add_dataset, add_extent, add_out, add_topics, extent_of, spec_of
 
 
 def add_commands(commands: Commands) -> None:
@@ -31,6 +31,7 @@ def _add_evaluate(commands: Commands) -> None:
         metavar="BAG",
         help="recording whose ground truth counts (default: that in the result bag)",
     )
+    add_topics(parser)
     parser.set_defaults(command=_evaluate)
 
 
@@ -38,7 +39,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from hat_ros.bench.evaluation.result_folder import evaluate_folder
     from hat_ros.cli.console import print_figures
 
-    evaluate_folder(arguments.folder, arguments.truth)
+    evaluate_folder(arguments.folder, arguments.truth, arguments.image_topic, arguments.camera_info_topic)
     print_figures(arguments.folder)
     return 0
 
@@ -81,6 +82,7 @@ def _add_score(commands: Commands) -> None:
     add_camera(parser)
     parser.add_argument("--fps", type=float, metavar="X", help="its frame rate, if you measured it")
     add_dataset(parser)
+    add_topics(parser)
     parser.add_argument("--sequence", default="", metavar="NAME", help="which sequence of the data set")
     add_out(parser, "result folder to write")
     add_extent(parser)

@@ -118,6 +118,20 @@ def add_dataset(parser: argparse.ArgumentParser, what: str = "the recording is a
     )
 
 
+def add_topics(parser: argparse.ArgumentParser) -> None:
+    """``--image-topic`` and ``--camera-info-topic``, where a bag is read."""
+    parser.add_argument(
+        "--image-topic",
+        metavar="TOPIC",
+        help="images of a bag with several cameras (default: /image, or the only one that is no depth image)",
+    )
+    parser.add_argument(
+        "--camera-info-topic",
+        metavar="TOPIC",
+        help="calibration of these images (default: camera_info in the namespace of the images)",
+    )
+
+
 def spec_of(arguments: argparse.Namespace) -> SourceSpec:
     """The recording that a command's ``recording``, :func:`add_dataset` and ``--sequence`` name."""
     from hat_ros.bench.source import SourceSpec
@@ -125,7 +139,15 @@ def spec_of(arguments: argparse.Namespace) -> SourceSpec:
 
     if bool(arguments.dataset) != bool(arguments.sequence):
         raise UsageError("--dataset and --sequence belong together: name the layout and one of its sequences")
-    return SourceSpec(arguments.recording, arguments.dataset, arguments.sequence, arguments.model, arguments.detections)
+    return SourceSpec(
+        arguments.recording,
+        arguments.dataset,
+        arguments.sequence,
+        arguments.model,
+        arguments.detections,
+        arguments.image_topic,
+        arguments.camera_info_topic,
+    )
 
 
 def add_extent(parser: argparse.ArgumentParser) -> None:

@@ -14,6 +14,7 @@ from hat_ros.cli.options import (
     add_extent,
     add_out,
     add_threads,
+    add_topics,
     config_of,
     extent_of,
     limit_threads,
@@ -46,6 +47,7 @@ def _add_replay(commands: Commands) -> None:
         default="processes",
         help="five processes, or all nodes in one (default: processes)",
     )
+    add_topics(parser)
     add_camera(parser)
     _add_credits(parser, "graph.credits_replay")
     parser.add_argument("--live", action="store_true", help="play in real time; frames are dropped, not queued")
@@ -79,6 +81,8 @@ def _replay(arguments: argparse.Namespace) -> int:
         live=arguments.live,
         rate=arguments.rate,
         domain=arguments.domain,
+        image_topic=arguments.image_topic,
+        camera_info_topic=arguments.camera_info_topic,
         **extent_of(arguments),
     )
     with state_progress("replaying", arguments.quiet) as watch:
@@ -109,6 +113,7 @@ def _add_track(commands: Commands) -> None:
         "offline: all frames jointly (whole-clip smoothing, not causal); srt3d: region tracker started by the best "
         "hypothesis; observe: front ends only, candidates at every frame, no poses (default: hat)",
     )
+    add_topics(parser)
     add_camera(parser)
     _add_credits(parser, "2, or graph.credits_replay where that is less")
     add_extent(parser)

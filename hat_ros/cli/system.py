@@ -11,6 +11,7 @@ from hat_ros.cli.options import (
     add_config,
     add_dataset,
     add_threads,
+    add_topics,
     config_of,
     limit_threads,
     positive,
@@ -116,6 +117,7 @@ def _add_profile(commands: Commands) -> None:
     add_dataset(parser)
     parser.add_argument("--sequence", default="", metavar="NAME", help="which sequence of the data set")
     add_config(parser)
+    add_topics(parser)
     add_camera(parser)
     parser.add_argument("--limit", type=positive, metavar="N", help="at most N frames (default: all)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there as well")

@@ -1,6 +1,7 @@
 """Reads recordings: rosbag2 folders with images, calibration, perhaps masks and ground truth, and the CAD model.
 
-Bags of any origin are read: any topic names, MCAP or sqlite3 storage, with or without a manifest. No ROS is needed.
+Bags of any origin are read: any topic names, MCAP or sqlite3 storage, one file or many, with or without a
+manifest. No ROS is needed.
 """
 
 from __future__ import annotations
@@ -18,18 +19,15 @@ from hat_ros.config import CameraConfig
 from hat_ros.errors import BagError, FrameError, HatError
 from hat_ros.geometry import lie
 from hat_ros.io import messages, topics
-from hat_ros.io.calibration import Calibration, calibration_from, camera_info_topic_of
+from hat_ros.io.bag_files import BagFiles
+from hat_ros.io.calibration import Calibration, calibration_from
 from hat_ros.io.frame_decoder import FrameDecoder
-from hat_ros.io.integrity import check_mcap
 from hat_ros.io.manifest import TARGET_FILE, check_manifest
-from hat_ros.io.rosbag import deserialize, opened_bag, stamp_of_cdr
+from hat_ros.io.rosbag import deserialize, stamp_of_cdr
+from hat_ros.io.topic_choice import COMPRESSED_KIND, IMAGE_KIND, choose_camera_info, choose_image
 from hat_ros.types import Camera, Frame
 
-_IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
-_CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
-_MASK_TYPE = "sensor_msgs/msg/Image"
 _POSE_TYPE = "geometry_msgs/msg/PoseStamped"
-_MAX_METADATA_BYTES = 16 * 2**20
 
 
 @dataclass(frozen=True)
@@ -53,11 +51,9 @@ class BagReader:
     """Reads a recording.
 
     Args:
-        path: the bag's folder, or a single ``.mcap`` file.
-        image_topic: topic of the images; found by itself when the bag has ``/image``, ``/image/compressed`` or only one
-            image topic.
-        camera_info_topic: topic of the calibration; by default ``camera_info`` in the image's own namespace, else
-            found likewise.
+        path: the bag's folder, with or without ``metadata.yaml``, or a single ``.mcap`` or ``.db3`` file.
+        image_topic: topic of the images; None = see :func:`~hat_ros.io.topic_choice.choose_image`.
+        camera_info_topic: topic of the calibration; None = see :func:`~hat_ros.io.topic_choice.choose_camera_info`.
         mask_topic: topic of given detections (mono8: 255 silhouette, 128 box, 0 outside).
         truth_topic: topic of true poses (PoseStamped, ``T_cam_target``); only for evaluation.
         camera_config: what the messages do not say of the camera; None = find out.
@@ -80,75 +76,44 @@ class BagReader:
         self.path = Path(path)
         self._camera_config = camera_config or CameraConfig()
         self._has_decoder = False
-        self._check_files()
-        with opened_bag(self.path) as reader:
-            self._types = {c.topic: c.msgtype for c in reader.connections}
-            self._counts = {c.topic: c.msgcount for c in reader.connections}
-        self.image_topic = self._choose("image", image_topic, _IMAGE_TYPES, topics.IMAGE, topics.IMAGE_COMPRESSED)
-        usual = camera_info_topic_of(self.image_topic), topics.CAMERA_INFO
-        self.camera_info_topic = self._choose("camera_info", camera_info_topic, (_CAMERA_INFO_TYPE,), *usual)
-        self.mask_topic = self._optional("mask", mask_topic, _MASK_TYPE)
+        check_manifest(self.path)
+        self._files = BagFiles(self.path)
+        try:
+            self.image_topic = choose_image(self._files.topics, image_topic, self._first_encoding)
+            self.camera_info_topic = choose_camera_info(self._files.topics, camera_info_topic, self.image_topic)
+        except BagError as error:
+            raise BagError(f"{self.path} {error}") from None
+        self.mask_topic = self._optional("mask", mask_topic, IMAGE_KIND)
         self.truth_topic = self._optional("truth", truth_topic, _POSE_TYPE)
 
-    def _check_files(self) -> None:
-        folder = self.path
-        if not folder.exists():
-            raise BagError(f"bag {folder} does not exist")
-        if folder.is_dir() and not (folder / "metadata.yaml").is_file():
-            raise BagError(f"{folder} is not a rosbag2 folder: it has no metadata.yaml (interrupted recording?)")
-        if folder.is_dir() and (folder / "metadata.yaml").stat().st_size > _MAX_METADATA_BYTES:
-            raise BagError(f"{folder}/metadata.yaml is larger than {_MAX_METADATA_BYTES // 2**20} MiB")
-        check_manifest(folder)
-        for file in sorted(folder.glob("*.mcap")) if folder.is_dir() else [folder]:
-            if file.suffix == ".mcap":
-                check_mcap(file)
-
-    def _choose(self, what: str, given: str | None, types: tuple[str, ...], *usual: str) -> str:
-        fitting = sorted(name for name, kind in self._types.items() if kind in types)
-        if given is not None:
-            if given not in fitting:
-                raise BagError(f"{self.path} has no {what} topic '{given}', it has: {', '.join(fitting) or 'none'}")
-            return given
-        for name in usual:
-            if name in fitting:
-                return name
-        fitting = [name for name in fitting if name not in (topics.DETECTION_MASK,)]
-        if len(fitting) == 1:
-            return fitting[0]
-        short = " or ".join(kind.rsplit("/", 1)[-1] for kind in types)
-        if not fitting:
-            raise BagError(f"{self.path} has no {what} topic ({short}), topics are: {', '.join(sorted(self._types))}")
-        raise BagError(f"{self.path} has several {what} topics, choose one: {', '.join(fitting)}")
+    def _first_encoding(self, topic: str) -> str:
+        return next((str(message.encoding) for message in self.messages(topic)), "")
 
     def _optional(self, what: str, topic: str, kind: str) -> str | None:
-        found = self._types.get(topic)
-        if found not in (None, kind):
-            raise BagError(f"{self.path}: {what} topic '{topic}' must be {kind}, found {found}")
-        return topic if found and self._counts[topic] else None
-
-    def _raw(self, topic: str) -> Iterator[tuple[bytes, str]]:
-        with opened_bag(self.path) as reader:
-            connections = [c for c in reader.connections if c.topic == topic]
-            for connection, _, data in reader.messages(connections=connections):
-                yield bytes(data), connection.msgtype
+        found = self._files.topics.get(topic)
+        if found is None:
+            return None
+        if found.kind != kind:
+            raise BagError(f"{self.path}: {what} topic '{topic}' must be {kind}, found {found.kind}")
+        return topic if found.count else None
 
     def messages(self, topic: str) -> Iterator[Any]:
         """All messages of a topic, deserialized, in recorded order."""
-        for data, kind in self._raw(topic):
-            yield deserialize(data, kind, self.path)
+        for message in self._files.messages((topic,)):
+            yield deserialize(message.data, message.kind, self.path)
 
     def __len__(self) -> int:
-        return self._counts[self.image_topic]
+        return self._files.topics[self.image_topic].count
 
     @property
     def topics(self) -> dict[str, str]:
         """Topic -> message type of everything in the bag."""
-        return dict(self._types)
+        return {name: topic.kind for name, topic in self._files.topics.items()}
 
     @property
     def compressed(self) -> bool:
         """The images are JPEG or PNG."""
-        return self._types[self.image_topic] == _IMAGE_TYPES[1]
+        return self._files.topics[self.image_topic].kind == COMPRESSED_KIND
 
     @property
     def has_masks(self) -> bool:
@@ -188,7 +153,7 @@ class BagReader:
 
     def _no_calibration(self) -> str:
         topic = f"{self.path}: topic {self.camera_info_topic}"
-        if not self._counts[self.camera_info_topic]:
+        if not self._files.topics[self.camera_info_topic].count:
             return f"{topic} has no message: the calibration is missing"
         return f"{topic} says that the camera is not calibrated, K has no focal length: calibrate it or give K"
 
@@ -228,7 +193,7 @@ class BagReader:
             BagError: a message cannot be deserialized.
             FrameError: an image or mask is malformed.
         """
-        image = deserialize(packet.image, self._types[self.image_topic], self.path)
+        image = deserialize(packet.image, self._files.topics[self.image_topic].kind, self.path)
         return decoder.frame(packet.stamp_ns, image, self._mask_message(packet) if masks else None)
 
     def decoded_mask(self, packet: Packet, decoder: FrameDecoder) -> UInt8 | None:
@@ -237,7 +202,7 @@ class BagReader:
         return None if message is None else decoder.mask(message)
 
     def _mask_message(self, packet: Packet) -> Any | None:
-        return None if packet.mask is None else deserialize(packet.mask, _MASK_TYPE, self.path)
+        return None if packet.mask is None else deserialize(packet.mask, IMAGE_KIND, self.path)
 
     def packets(self) -> Iterator[Packet]:
         """The images as recorded, each with the mask of its exact stamp."""
@@ -246,8 +211,8 @@ class BagReader:
             yield Packet(stamp_ns, data, self.compressed, masks.take(stamp_ns) if masks else None)
 
     def _stamped(self, topic: str) -> Iterator[tuple[int, bytes]]:
-        for data, _ in self._raw(topic):
-            yield stamp_of_cdr(data, self.path), data
+        for message in self._files.messages((topic,)):
+            yield stamp_of_cdr(message.data, self.path), message.data
 
     def truth(self) -> dict[int, Float]:
         """True ``T_cam_target`` (4, 4) by exact stamp; empty when the bag has none.

@@ -51,12 +51,6 @@ class Calibration:
         return self.lens.is_same(other.lens, _SAME)
 
 
-def camera_info_topic_of(image_topic: str) -> str:
-    """Where the calibration of an image is by ROS convention: ``camera_info`` beside the image, in its namespace."""
-    namespace, _, _ = image_topic.removesuffix("/compressed").rpartition("/")
-    return f"{namespace}/camera_info"
-
-
 def calibration_from(message: Any, image_topic: str, rectified: str) -> Calibration | None:
     """Decode a CameraInfo; None for one that says "not calibrated" (no focal length in K).
 

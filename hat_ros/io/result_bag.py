@@ -16,9 +16,10 @@ import numpy as np
 from hat_ros.array_types import Float
 from hat_ros.errors import BagError
 from hat_ros.io import messages, topics
+from hat_ros.io.bag_files import METADATA_FILE, BagFiles
 from hat_ros.io.bag_writer import BagWriter
 from hat_ros.io.manifest import check_manifest
-from hat_ros.io.rosbag import TYPESTORE, deserialize, opened_bag
+from hat_ros.io.rosbag import TYPESTORE, deserialize
 from hat_ros.io.run_log import RunLog, RunLogBuilder
 from hat_ros.tracker import Step
 from hat_ros.types import Alignment, Camera, Candidates, Estimate, Motion
@@ -164,13 +165,10 @@ def _messages(path: Path) -> dict[str, dict[int, Any]]:
 
 def _read(path: Path, names: Collection[str]) -> dict[str, list[Any]]:
     """Topic -> messages in order."""
-    if not (path / "metadata.yaml").is_file():
+    if not (path / METADATA_FILE).is_file():
         raise BagError(f"{path} is no result bag: it has no metadata.yaml (a run that was killed?)")
     check_manifest(path)
     out: dict[str, list[Any]] = {topic: [] for topic in names}
-    with opened_bag(path) as reader:
-        wanted = [connection for connection in reader.connections if connection.topic in out]
-        if wanted:  # of no connections, the reader gives the messages of all
-            for connection, _, data in reader.messages(connections=wanted):
-                out[connection.topic].append(deserialize(bytes(data), connection.msgtype, path))
+    for message in BagFiles(path).messages(names):
+        out[message.topic].append(deserialize(message.data, message.kind, path))
     return out

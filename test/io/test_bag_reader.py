@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-
 import numpy as np
 import pytest
 from recording import CAMERA, WIRE, N, image, mask, stamp
@@ -23,12 +21,11 @@ def foreign(path, image_topic="/cam0/image_raw", plugin=StoragePlugin.SQLITE3, e
     with Writer(path, version=9, storage_plugin=plugin) as writer:
         info = writer.add_connection("/cam0/camera_info", "sensor_msgs/msg/CameraInfo", typestore=TYPESTORE)
         images = writer.add_connection(image_topic, "sensor_msgs/msg/Image", typestore=TYPESTORE)
-        for topic in extra:
-            writer.add_connection(topic, "sensor_msgs/msg/Image", typestore=TYPESTORE)
+        others = [writer.add_connection(topic, "sensor_msgs/msg/Image", typestore=TYPESTORE) for topic in extra]
         for index in range(n):
             for connection, message in (
                 (info, WIRE.camera_info(stamp(index), "cam0", camera)),
-                (images, WIRE.image(stamp(index), "cam0", "bgr8", image(index)[..., ::-1])),
+                *((to, WIRE.image(stamp(index), "cam0", "bgr8", image(index)[..., ::-1])) for to in (images, *others)),
             ):
                 data = TYPESTORE.serialize_cdr(message, connection.msgtype)
                 writer.write(connection, stamp(index) + 5_000_000, data)
@@ -50,7 +47,7 @@ def test_a_single_mcap_file_is_a_bag_too(bag):
 
 def test_several_image_topics_must_be_chosen_from(tmp_path):
     path = foreign(tmp_path / "bag", extra=("/cam1/image_raw",))
-    with pytest.raises(BagError, match=r"several image topics, choose one: /cam0/image_raw, /cam1/image_raw"):
+    with pytest.raises(BagError, match="several image topics, choose one by --image-topic: /cam0/image_raw, /cam1/"):
         BagReader(path)
     assert len(BagReader(path, image_topic="/cam0/image_raw")) == 3
     with pytest.raises(BagError, match="no image topic '/nope', it has: /cam0"):
@@ -61,7 +58,7 @@ def test_missing_things_are_named(tmp_path, bag):
     with pytest.raises(BagError, match="does not exist"):
         BagReader(tmp_path / "nothing")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(BagError, match=r"no metadata\.yaml"):
+    with pytest.raises(BagError, match=r"neither metadata\.yaml nor a file"):
         BagReader(tmp_path / "empty")
     with BagWriter(tmp_path / "no_images") as writer:
         writer.write_message(topics.CAMERA_INFO, WIRE.camera_info(1, "c", CAMERA), 1)
@@ -181,18 +178,6 @@ def test_masks_out_of_order_still_find_their_images(tmp_path):
             writer.write_frame(stamp(index), image(index), CAMERA)
     found = [frame.given_mask is not None for frame in BagReader(tmp_path / "bag").frames()]
     assert found == [True, True, True, False]
-
-
-def test_compressed_storage_modes_are_refused_with_advice(bag, tmp_path):
-    copy = tmp_path / "copy"
-    shutil.copytree(bag, copy)
-    (copy / MANIFEST).unlink()
-    metadata = (copy / "metadata.yaml").read_text()
-    metadata = metadata.replace("compression_mode: ''", "compression_mode: message")
-    metadata = metadata.replace("compression_format: ''", "compression_format: zstd")
-    (copy / "metadata.yaml").write_text(metadata)
-    with pytest.raises(BagError, match="ros2 bag convert"):
-        BagReader(copy)
 
 
 def calibrated(path, calibrations):

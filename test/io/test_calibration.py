@@ -7,7 +7,7 @@ import pytest
 from camera_info import LENSES, SIZE, WIRE, K, P, info
 
 from hat_ros.errors import FrameError
-from hat_ros.io.calibration import calibration_from, camera_info_topic_of
+from hat_ros.io.calibration import calibration_from
 
 BARREL = LENSES["plumb_bob"]
 NO_D = (0.0,) * 5
@@ -149,16 +149,3 @@ def test_jitter_is_no_new_calibration_and_a_change_is(model):
     assert not first.is_same(found(0.0, 1e-2))
     assert not first.is_same(calibration_from(info(), "/i", "auto"))
     assert not first.is_same(calibration_from(info(d=LENSES[model], model=model, size=(640, 480)), "/i", "auto"))
-
-
-@pytest.mark.parametrize(
-    ("image", "expected"),
-    [
-        ("/image", "/camera_info"),
-        ("/image/compressed", "/camera_info"),
-        ("/cam/image_raw", "/cam/camera_info"),
-        ("/camera/color/image_raw/compressed", "/camera/color/camera_info"),
-    ],
-)
-def test_the_calibration_stands_beside_the_image(image, expected):
-    assert camera_info_topic_of(image) == expected

@@ -72,12 +72,16 @@ def complete_folder(folder: Path, source: Source | None, measured: dict[str, Any
         _report(folder, log, figures, strip)
 
 
-def evaluate_folder(folder: Path, truth: Path | None = None) -> None:
+def evaluate_folder(
+    folder: Path, truth: Path | None = None, image_topic: str | None = None, camera_info_topic: str | None = None
+) -> None:
     """Score a finished run again, perhaps against another ground truth, and rewrite tables, metrics and report.
 
     Args:
         folder: result folder; what the run itself measured is kept from its ``metrics.json``.
         truth: recording whose ground truth counts; by default that in the result bag.
+        image_topic: topic of the images, where that recording is a bag; None = find it.
+        camera_info_topic: likewise of the calibration.
 
     Raises:
         UsageError: it is no result folder.
@@ -85,7 +89,12 @@ def evaluate_folder(folder: Path, truth: Path | None = None) -> None:
     """
     run, figures, _ = read_folder(folder)
     log = read_result_bag(folder / BAG_FOLDER)
-    source = _source_of(run, folder) if truth is None else open_source(truth, camera_config=_camera_of(folder))
+    if truth is None:
+        source = _source_of(run, folder)
+    else:
+        source = open_source(
+            truth, camera_config=_camera_of(folder), image_topic=image_topic, camera_info_topic=camera_info_topic
+        )
     if truth is not None and source is not None:
         first, last = int(log.stamp_ns[0]), int(log.stamp_ns[-1])
         log = log.with_truth({stamp: row for stamp, row in source.truth_rows().items() if first <= stamp <= last})
@@ -180,7 +189,14 @@ def _source_of(run: dict[str, Any], folder: Path) -> Source | None:
     """The recording that a run was made from, None when it is no longer there."""
     try:
         model = run.get("model")
-        spec = SourceSpec(Path(run["source"]), run.get("dataset", ""), run.get("sequence", ""), model and Path(model))
+        spec = SourceSpec(
+            Path(run["source"]),
+            run.get("dataset", ""),
+            run.get("sequence", ""),
+            model and Path(model),
+            image_topic=run.get("image_topic"),
+            camera_info_topic=run.get("camera_info_topic"),
+        )
         return spec.open(_camera_of(folder))
     except HatError:
         return None

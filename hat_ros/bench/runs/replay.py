@@ -33,6 +33,8 @@ class ReplayOptions(RunOptions):
         live: play in real time and let the graph drop what it cannot keep up with.
         rate: speed of live play.
         domain: ROS domain, for nodes of one's own that listen; None = a free one.
+        image_topic: topic of the images in the bag; None = find it.
+        camera_info_topic: topic of the calibration in the bag; None = find it.
     """
 
     graph: str = "processes"
@@ -40,6 +42,8 @@ class ReplayOptions(RunOptions):
     live: bool = False
     rate: float = 1.0
     domain: int | None = None
+    image_topic: str | None = None
+    camera_info_topic: str | None = None
 
 
 def replay_bag(path: Path, out: Path, config: HatConfig, options: ReplayOptions, watch: Watcher | None = None) -> Path:
@@ -64,7 +68,7 @@ def replay_bag(path: Path, out: Path, config: HatConfig, options: ReplayOptions,
             f"`pip install 'hat_ros[ros]'`), or use `hat track`, which needs none"
         ) from None
     folder = ResultFolder(out, options.overwrite)
-    spec = SourceSpec(path)
+    spec = SourceSpec(path, image_topic=options.image_topic, camera_info_topic=options.camera_info_topic)
     source = spec.open(config.camera)
     if not isinstance(source.recording, BagReader):
         raise UsageError(f"{path} is no bag: `hat import sequence {path} --out BAG` makes one, `hat track` needs none")
@@ -90,6 +94,8 @@ def replay_bag(path: Path, out: Path, config: HatConfig, options: ReplayOptions,
             live=options.live,
             rate=options.rate,
             domain_id=options.domain,
+            image_topic=source.recording.image_topic,
+            camera_info_topic=source.recording.camera_info_topic,
             first_frame=options.start,
             max_frames=options.limit,
             on_progress=progress,
