@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import os
 import re
 import typing
 from collections.abc import Mapping, Sequence
@@ -14,10 +15,9 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import yaml
-
 from hat_ros.config.option import Value
 from hat_ros.config.schema import HatConfig
+from hat_ros.config.yaml_text import parse_yaml, read_yaml
 from hat_ros.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -27,23 +27,6 @@ if TYPE_CHECKING:
 
 # YAML 1.1 takes these for words: it wants a point in the number and a sign in the exponent.
 _NUMBER_WITH_EXPONENT = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+")
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML in which a key may stand only once; in the standard loader the last one wins silently."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """See the base class.
-
-        Raises:
-            ConstructorError: a key stands twice.
-        """
-        seen = set()
-        for key, _ in node.value:
-            if isinstance(key, yaml.ScalarNode) and key.value in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"key '{key.value}' stands twice", key.start_mark)
-            seen.add(key.value if isinstance(key, yaml.ScalarNode) else key)
-        return super().construct_mapping(node, deep)
 
 
 def preset_folder() -> Path:
@@ -85,12 +68,8 @@ def config_to_dict(config: HatConfig) -> dict[str, Any]:
 
 
 def parse_value(text: str) -> object:
-    """A value as it stands in a file or after ``--set key=``.
-
-    Raises:
-        YAMLError: it is not valid YAML.
-    """
-    return yaml.load(text, _Loader)
+    """A value as it stands in a file or after ``--set key=``; errors of :func:`parse_yaml`."""
+    return parse_yaml(text)
 
 
 def flat_options(
@@ -116,16 +95,10 @@ def _read(name_or_file: str, readers: tuple[str, ...]) -> dict[str, Any]:
     """What a preset or file states, on top of its base; ``readers`` are the presets that have it as their base."""
     is_file = name_or_file.endswith((".yaml", ".yml"))
     path = Path(name_or_file) if is_file else preset_folder() / f"{name_or_file}.yaml"
-    if not path.is_file():
+    if (not is_file and name_or_file not in preset_names()) or (is_file and not os.path.isfile(path)):
         known = ", ".join(preset_names())
         raise ConfigError(f"no configuration '{name_or_file}': presets are {known}, or give a .yaml file")
-    try:
-        with path.open(encoding="utf-8") as stream:
-            data = yaml.load(stream, _Loader)
-    except OSError as error:
-        raise ConfigError(f"cannot read {path}: {error.strerror}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
+    data = read_yaml(path)
     if data is None:
         return {}
     if not isinstance(data, dict):
@@ -135,7 +108,7 @@ def _read(name_or_file: str, readers: tuple[str, ...]) -> dict[str, Any]:
     base = data.pop("base")
     if base not in preset_names() or base in (*readers, name_or_file):
         others = ", ".join(name for name in preset_names() if name not in (*readers, name_or_file))
-        raise ConfigError(f"{path}: base must be one of the presets {others}; found {base!r}")
+        raise ConfigError(f"{path}: base must be one of the presets {others}; found {base!r:.80}")
     return _merged(_read(base, (*readers, name_or_file)), data)
 
 
@@ -160,13 +133,13 @@ def _apply_override(data: dict[str, Any], override: str) -> None:
             raise ConfigError(f"override '{override}': '{section}' is a value, not a section")
     try:
         node[last] = parse_value(value)
-    except yaml.YAMLError:
-        raise ConfigError(f"override '{override}': the value is not valid YAML") from None
+    except ConfigError as error:
+        raise ConfigError(f"override '{override[:80]}': the value is not valid YAML ({error})") from None
 
 
 def _build(cls: type[Section], data: object, prefix: str) -> Section:
     if not isinstance(data, Mapping):
-        raise ConfigError(f"{prefix.rstrip('.') or 'configuration'}: expected a mapping, found {data!r}")
+        raise ConfigError(f"{prefix.rstrip('.') or 'configuration'}: expected a mapping, found {data!r:.80}")
     known = {item.name: item for item in dataclasses.fields(cls)}
     hints = typing.get_type_hints(cls)
     values = {}
@@ -174,7 +147,7 @@ def _build(cls: type[Section], data: object, prefix: str) -> Section:
         if key not in known:
             close = difflib.get_close_matches(str(key), known, n=1)
             advice = f"did you mean '{prefix}{close[0]}'?" if close else f"known keys: {', '.join(sorted(known))}"
-            raise ConfigError(f"unknown key '{prefix}{key}': {advice}")
+            raise ConfigError(f"unknown key '{prefix}{key!s:.80}': {advice}")
         if dataclasses.is_dataclass(hints[key]):
             values[key] = _build(hints[key], value, f"{prefix}{key}.")
         else:
@@ -194,7 +167,7 @@ def _check(name: str, value: object, hint: type, metadata: Mapping[str, Any]) ->
         value = str(value).lower()  # a word that YAML and ROS take for something else: true, 12
     accepts = (int, float) if hint is float else (hint,)
     if not isinstance(value, accepts) or (isinstance(value, bool) and hint is not bool):
-        raise ConfigError(f"{name}: expected {hint.__name__}, found {value!r} ({type(value).__name__})")
+        raise ConfigError(f"{name}: expected {hint.__name__}, found {value!r:.80} ({type(value).__name__})")
     checked: Value = hint(value)
     low, high, choices = metadata["low"], metadata["high"], metadata["choices"]
     if checked != checked:
@@ -204,5 +177,5 @@ def _check(name: str, value: object, hint: type, metadata: Mapping[str, Any]) ->
     if high is not None and checked > high:
         raise ConfigError(f"{name}: must be at most {high}, found {checked}")
     if choices and checked not in choices:
-        raise ConfigError(f"{name}: must be one of {', '.join(choices)}, found '{checked}'")
+        raise ConfigError(f"{name}: must be one of {', '.join(choices)}, found '{checked!s:.80}'")
     return checked

@@ -12,9 +12,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import trimesh
-import yaml
 
-from hat_ros.errors import MeshError
+from hat_ros.config.yaml_text import read_yaml
+from hat_ros.errors import ConfigError, MeshError
 from hat_ros.target.brep import BREP_SUFFIXES, glb_of_brep
 from hat_ros.target.companions import MATERIAL_SUFFIX, Companions, copy_with_companions, say_once
 from hat_ros.target.obj_text import material_libraries, plain_obj
@@ -34,12 +34,12 @@ def read_target_yaml(path: Path) -> tuple[Path, float | None, str]:
         MeshError: malformed, or the mesh does not lie beside it.
     """
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise MeshError(f"{path}: not valid YAML ({' '.join(str(error).split())})") from None
+        data = read_yaml(path)
+    except ConfigError as error:
+        raise MeshError(str(error)) from None
     if not isinstance(data, dict) or not isinstance(data.get("mesh"), str):
         raise MeshError(f"{path}: expected a mapping with the key 'mesh' naming a file beside it")
-    unknown = sorted(set(data) - {"mesh", "unit_scale", "name"})
+    unknown = sorted(set(map(str, data)) - {"mesh", "unit_scale", "name"})
     if unknown:
         raise MeshError(f"{path}: unknown key '{unknown[0]}', known keys are mesh, unit_scale, name")
     scale = data.get("unit_scale", 1.0)

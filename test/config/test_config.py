@@ -232,7 +232,7 @@ def test_presets_based_on_each_other_are_refused(tmp_path, monkeypatch):
 def test_a_key_that_stands_twice_is_an_error(text, tmp_path):
     path = tmp_path / "twice.yaml"
     path.write_text(text)
-    with pytest.raises(ConfigError, match=r"key '(a|loss|fusion)' stands twice .*twice\.yaml\", line [23]"):
+    with pytest.raises(ConfigError, match=r"twice\.yaml: .*key '(a|loss|fusion)' stands twice in line [23]"):
         load_config(path)
 
 

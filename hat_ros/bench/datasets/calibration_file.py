@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from hat_ros.array_types import Float
-from hat_ros.errors import DatasetError, FrameError
+from hat_ros.config.yaml_text import read_yaml
+from hat_ros.errors import ConfigError, DatasetError, FrameError
 from hat_ros.io.lens import Lens
 from hat_ros.types import Camera
 
@@ -44,11 +44,9 @@ def read_camera_file(path: Path, rectified: bool = False) -> CameraFile:
         DatasetError: unreadable, or an entry is missing or impossible.
     """
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read ({error.strerror})") from None
-    except (UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
-        raise DatasetError(f"{path}: not valid YAML ({' '.join(str(error).split())[:160]})") from None
+        data = read_yaml(path)
+    except ConfigError as error:
+        raise DatasetError(str(error)) from None
     if not isinstance(data, dict):
         raise DatasetError(f"{path}: expected image_width, image_height and camera_matrix")
     width, height = (_numbers(data, names, 1, path)[0] for names in (_WIDTH, _HEIGHT))
