@@ -37,6 +37,7 @@ class Entrance:
         self._last_number: dict[str, int] = {}
         self._image_depth = image_depth
         self._decoder: FrameDecoder | None = None
+        self._count_gaps = True
         self.dropped_total = 0
         self.refusals = Refusals()
 
@@ -58,13 +59,17 @@ class Entrance:
             number: the publisher's sequence number if the middleware tells it. With a queue of one, DDS overwrites an
                 image that was not taken yet; only the gap in the numbers shows it.
         """
-        if number is not None:
+        if number is not None and self._count_gaps:
             self.dropped_total += max(0, number - self._last_number.get(topic, number - 1) - 1)
             self._last_number[topic] = number
         if self._live and self._images:
             self._images.clear()
             self.dropped_total += 1
         self._images.append((messages.stamp_of(message), message))
+
+    def forget_numbers(self) -> None:
+        """Gaps in the publisher's numbers mean nothing any more: there are several publishers."""
+        self._count_gaps = False
 
     def add_mask(self, message: Any) -> None:
         """Keep a mask for its image."""

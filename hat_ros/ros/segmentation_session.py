@@ -9,7 +9,7 @@ from typing import Any
 from rclpy.duration import Duration
 from std_srvs.srv import Trigger
 
-from hat_ros.errors import FrameError
+from hat_ros.errors import FrameError, RunError
 from hat_ros.io import messages, topics
 from hat_ros.io.calibration import calibration_from
 from hat_ros.ros import qos
@@ -61,6 +61,23 @@ class SegmentationSession(Session):
             subscribe(topics.DETECTION_MASK, self._on_mask, profile=qos.IN_REPLAY, required=not live)
         subscribe(topics.STATUS, self._on_status)
         subscribe(topics.READY, self._on_ready, profile=qos.LATCH_READER, required=False)
+
+    def every_second(self) -> None:
+        """Notice a second camera on the same topic: the frames of both would be one sequence.
+
+        Raises:
+            RunError: there is one, in a replay.
+        """
+        for topic in map(self._node.resolve_topic_name, (topics.IMAGE, topics.IMAGE_COMPRESSED)):
+            found = self._node.get_publishers_info_by_topic(topic)
+            if len(found) < 2:
+                continue
+            names = ", ".join(sorted(f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in found))
+            sentence = f"{topic} has {len(found)} publishers ({names}): stop all but one, or remap image"
+            if not self._node.settings.live:
+                raise RunError(sentence)
+            self._entrance.forget_numbers()  # those of several publishers do not belong together
+            self._diagnostics.report(WARN, sentence)
 
     def close(self) -> None:
         """Drop the service and the timer."""

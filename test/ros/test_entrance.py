@@ -69,6 +69,15 @@ def test_images_that_the_middleware_overwrote_are_drops():
     assert waiting.dropped_total == 4, "one of the two was replaced, none was overwritten"
 
 
+def test_numbers_of_two_publishers_are_no_gaps():
+    waiting = entrance(live=True)
+    waiting.forget_numbers()
+    for stamp, number in ((5, 1), (6, 900), (7, 2), (8, 901)):
+        waiting.add_image("/image", image(stamp), number)
+        waiting.next_frame(Admission(1))
+    assert waiting.dropped_total == 0
+
+
 @pytest.mark.parametrize(
     ("bad", "complaint"),
     [

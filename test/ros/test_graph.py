@@ -13,8 +13,9 @@ from std_srvs.srv import Trigger
 
 from hat_ros.config import config_from_dict, config_to_dict
 from hat_ros.errors import BagError, ConfigError, InputError, RunError, StageTimeoutError
-from hat_ros.io import topics
+from hat_ros.io import messages, topics
 from hat_ros.io.result_bag import read_result_bag, read_stage_ms
+from hat_ros.ros.domain import reserved_domain
 from hat_ros.ros.graph import replay
 from hat_ros.types import Camera, TrackState
 
@@ -222,6 +223,21 @@ def test_live_goes_on_in_a_new_epoch_after_a_stage_hung(clean_bag, config, tmp_p
 
 
 # ------------------------------------------------------------------ bad input
+
+
+def test_a_second_camera_on_the_same_topic_is_named(clean_bag, config, tmp_path):
+    context = rclpy.Context()
+    with reserved_domain(None) as domain:
+        rclpy.init(context=context, domain_id=domain)
+        other = rclpy.create_node("other_camera", context=context)
+        kind = messages.message_class(topics.TYPES[topics.IMAGE])
+        other.create_publisher(kind, topics.IMAGE, 1)
+        try:
+            with pytest.raises(RunError, match=r"/image has 2 publishers \(/hat/player, /other_camera\): stop"):
+                replay(clean_bag, config, clean_bag / "target.yaml", tmp_path / "out", graph="single", domain_id=domain)
+        finally:
+            other.destroy_node()
+            context.try_shutdown()
 
 
 def test_a_bad_target_is_one_sentence_from_the_node(clean_bag, config, tmp_path):
