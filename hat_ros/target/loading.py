@@ -180,7 +180,11 @@ def _part(scene: trimesh.Scene, node: str, name: str) -> _Part | None:
     faces = np.asarray(mesh.faces)
     if faces.min() < 0 or faces.max() >= len(mesh.vertices):
         raise MeshError(f"CAD model {name}: part '{geometry_name}' has faces that refer to missing vertices")
-    vertices = np.asarray(mesh.vertices, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
+    points = np.asarray(mesh.vertices, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise MeshError(f"CAD model {name}: some vertices have fewer than three coordinates; repair or export it again")
+    # Infinite ones would spoil others in the product; only those that a face uses are an error.
+    vertices = np.where(np.isfinite(points), points, np.nan) @ T[:3, :3].T + T[:3, 3]
     n_faces = len(faces)
     corner_uv = np.zeros((n_faces, 3, 2), np.float32)
     corner_rgb, texture, rgb = None, None, np.full((n_faces, 3), _GREY, np.uint8)
@@ -209,8 +213,10 @@ def _corner_normals(mesh: trimesh.Trimesh, corners: Float, faces: Int, linear: F
     normal = flat
     # trimesh would compute vertex normals on demand; only those read from the file are in its cache at this point.
     if "vertex_normals" in mesh._cache:
-        own = np.asarray(mesh.vertex_normals, dtype=np.float64) @ np.linalg.pinv(linear)
-        normal = np.where(np.isfinite(own[faces]).all(axis=-1, keepdims=True), own[faces], flat)
+        read = np.asarray(mesh.vertex_normals, dtype=np.float64)
+        usable: Bool = np.asarray(np.isfinite(read).all(axis=-1, keepdims=True))
+        own = np.where(usable, read, 0.0) @ np.linalg.pinv(linear)
+        normal = np.where(usable[faces], own[faces], flat)
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     normal = np.where(length > 1e-12, normal, flat)
     return (normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-300)).astype(np.float32)

@@ -195,3 +195,50 @@ def test_degenerate_triangles_are_removed_without_a_word(tmp_path, caplog, suffi
     assert len(target.vertices_m) == 8 and np.isfinite(target.surface.corner_normal).all()
     np.testing.assert_allclose(target.center_m, 0, atol=1e-7)
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("stray", ["9 9 9", "nan 0 0", "inf 0 0", "1e300 0 0"])
+def test_a_vertex_that_no_face_uses_is_ignored_whatever_it_is(tmp_path, stray):
+    path = tmp_path / "stray.obj"
+    vertices = "".join(f"v {x} {y} {z}\n" for x, y, z in box().vertices)
+    faces = "".join(f"f {a} {b} {c}\n" for a, b, c in box().faces + 2)
+    path.write_text(f"v {stray}\n{vertices}{faces}")
+    target = load_target(path)
+    assert len(target.vertices_m) == 8
+    np.testing.assert_allclose(target.center_m, 0, atol=1e-7)
+    assert target.bounding_radius_m == pytest.approx(np.sqrt(14) / 2)
+
+
+@pytest.mark.parametrize("line", ["v 1 2", "v 1", "v 1 x 2"])
+def test_a_vertex_with_too_few_coordinates_is_one_sentence(tmp_path, line):
+    path = tmp_path / "short.obj"
+    path.write_text(f"v 0 0 0\nv 1 0 0\n{line}\nf 1 2 3\n")
+    with pytest.raises(MeshError, match="short"):
+        load_target(path)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("suffix", ["obj", "ply", "stl"])
+def test_text_meshes_damaged_at_random_give_a_model_or_one_sentence(tmp_path, suffix):
+    rng, path = np.random.default_rng(3), tmp_path / f"fuzz.{suffix}"
+    if suffix == "obj":
+        whole = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvn 0 0 1\nf -3/-1/-1 -2/-1/-1 -1/-1/-1\nv 0 0 1\nf -1 1 2\n" * 3
+    else:
+        ball = trimesh.creation.icosphere(1)
+        text = ball.export(file_type="stl_ascii") if suffix == "stl" else ball.export(file_type="ply", encoding="ascii")
+        whole = text.encode() if isinstance(text, str) else text
+    pieces = [b"-", b"nan", b"/", b" ", b"\\\n", b"\nf ", b"\n", b"1e999", b"usemtl x\n", b"\nv 1 2"]
+    for _ in range(150):
+        data = bytearray(whole)
+        for _ in range(rng.integers(1, 5)):
+            at = int(rng.integers(len(data)))
+            data[at : at + int(rng.integers(0, 8))] = pieces[rng.integers(len(pieces))]
+        path.write_bytes(data)
+        try:
+            target = load_target(path)
+        except MeshError as error:
+            assert "\n" not in str(error)
+            continue
+        assert np.isfinite(target.vertices_m).all() and np.isfinite(target.face_normals).all()
+        assert np.isfinite(target.surface.corner_normal).all()
