@@ -1,4 +1,4 @@
-"""The files of a bag as one stream of messages: MCAP or sqlite3, one or many, zstd-compressed or not.
+"""The files of a bag as one stream of messages: MCAP, sqlite3 or ROS 1, one or many, compressed or not.
 
 Of ``metadata.yaml`` only the list of files is used. Topics, types and counts come from the storage itself, so a bag is
 read without it, and whatever was edited in it (QoS, storage identifier, counts) does not matter.
@@ -25,6 +25,7 @@ from rosbags.rosbag2 import Reader
 from hat_ros.errors import BagError
 from hat_ros.io.damage import damage_as_bag_error
 from hat_ros.io.integrity import MAX_CHUNK_BYTES, check_mcap
+from hat_ros.io.ros1 import convert_ros1
 
 METADATA_FILE = "metadata.yaml"
 # What lies in a bag's folder under these names is read.
@@ -33,6 +34,7 @@ STORAGE_SUFFIXES = (".mcap", ".db3")
 _MAX_METADATA_BYTES = 16 * 2**20
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _CDR = "cdr"
+_ROS1_SUFFIX = ".bag"
 # A compressed file grows by this factor at most, or to this size: dark images compress well, bombs better.
 _MAX_GROWTH, _MAX_SMALL_BYTES = 200, 2**30
 _BLOCK_BYTES = 2**20
@@ -90,23 +92,15 @@ class BagFiles:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._unpacked: tempfile.TemporaryDirectory[str] | None = None  # its files go with this object
-        self._storages = [self._storage(file) for file in bag_files(path)]
+        files = bag_files(path)
+        # What must be unpacked or converted first lies there, and goes with this object.
+        self._made = tempfile.TemporaryDirectory(prefix="hat_bag_")
+        self._storages = [_storage(file, Path(self._made.name)) for file in files]
         self.topics: dict[str, Topic] = {}
         with damage_as_bag_error(path):
             for topic in (topic for storage in self._storages for topic in storage.topics()):
                 before = self.topics.get(topic.name)
                 self.topics[topic.name] = topic if before is None else replace(topic, count=topic.count + before.count)
-
-    def _storage(self, file: Path) -> _Storage:
-        if file.suffix == ".zstd":
-            if self._unpacked is None:
-                self._unpacked = tempfile.TemporaryDirectory(prefix="hat_bag_")
-            file = _unpacked(file, Path(self._unpacked.name) / file.stem)
-        if file.suffix == ".mcap":
-            check_mcap(file)
-            return _Mcap(file)
-        return _Sqlite(file)
 
     def messages(self, names: Collection[str]) -> Iterator[Recorded]:
         """The messages of these topics in the order of their bag time, over all files.
@@ -119,6 +113,17 @@ class BagFiles:
             yield from heapq.merge(*streams, key=attrgetter("log_ns"))
 
 
+def _storage(file: Path, scratch: Path) -> _Storage:
+    if file.suffix == ".zstd":
+        file = _unpacked(file, scratch / file.stem)
+    if file.suffix == _ROS1_SUFFIX:
+        file = convert_ros1(file, scratch)
+    if file.suffix == ".mcap":
+        check_mcap(file)
+        return _Mcap(file)
+    return _Sqlite(file)
+
+
 def bag_files(path: Path) -> list[Path]:
     """The files of a bag, in order.
 
@@ -127,19 +132,15 @@ def bag_files(path: Path) -> list[Path]:
     """
     if not path.exists():
         raise BagError(f"bag {path} does not exist")
-    ros1 = [path] if path.suffix == ".bag" else sorted(path.glob("*.bag")) if path.is_dir() else []
     found = [path] if path.is_file() else _listed(path) or _lying(path)
-    if ros1 and found in ([], ros1):
-        raise BagError(
-            f"{ros1[0]} is a ROS 1 bag: convert it with `rosbags-convert --src {ros1[0]} --dst "
-            f"{ros1[0].with_suffix('')}`, then give that folder"
-        )
+    if not found and path.is_dir():
+        found = _ros1_in(path)
     if not found:
         raise BagError(f"{path} is no bag: it has neither {METADATA_FILE} nor a file {' or '.join(STORAGE_SUFFIXES)}")
     for file in found:
         if not file.is_file():
             raise BagError(f"{path} lacks {file.name}, which its {METADATA_FILE} lists: copy the bag again")
-        if not _is_storage(file):
+        if not _is_storage(file) and file.suffix != _ROS1_SUFFIX:
             raise BagError(f"{file} is no file of a bag: they end in {' or '.join(STORAGE_SUFFIXES)}")
     return found
 
@@ -147,8 +148,8 @@ def bag_files(path: Path) -> list[Path]:
 def is_bag(path: Path) -> bool:
     """Whether there is something that calls itself a bag: ``metadata.yaml`` or a storage file."""
     if path.is_file():
-        return _is_storage(path) or path.suffix == ".bag"
-    return (path / METADATA_FILE).is_file() or any(_lying(path)) or any(path.glob("*.bag"))
+        return _is_storage(path) or path.suffix == _ROS1_SUFFIX
+    return (path / METADATA_FILE).is_file() or any(_lying(path)) or any(_ros1_in(path))
 
 
 def _is_storage(file: Path) -> bool:
@@ -159,6 +160,10 @@ def _lying(folder: Path) -> list[Path]:
     """What lies in a folder, ``x_2`` before ``x_10``."""
     found = [file for file in folder.iterdir() if file.is_file() and _is_storage(file)]
     return sorted(found, key=lambda file: [part.zfill(20) for part in re.split(r"(\d+)", file.name)])
+
+
+def _ros1_in(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.glob(f"*{_ROS1_SUFFIX}") if file.is_file())
 
 
 def _listed(folder: Path) -> list[Path]:

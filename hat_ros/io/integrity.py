@@ -78,7 +78,7 @@ def _check_chunk(file: BinaryIO, path: Path, length: int) -> None:
     (stored,) = struct.unpack("<Q", file.read(8))
     if stored > length - 40 - name_length:
         raise BagError(f"{path} is damaged: a chunk's data reach beyond its record")
-    count, crc = _inflated(file.read(stored), compression, declared, path)
+    count, crc = unpacked(stream_of(file.read(stored), compression, path), declared, path)
     if count != declared:
         raise BagError(f"{path}: a chunk does not unpack to the {declared} bytes that it declares")
     if expected_crc and crc != expected_crc:
@@ -109,11 +109,14 @@ def _recovery(path: Path) -> str:
     return f"copy it again, or save what is whole with `mcap recover {path} -o {path.stem}_whole.mcap`"
 
 
-def _inflated(data: bytes, compression: str, declared: int, path: Path) -> tuple[int, int]:
-    """Number of bytes the data unpack to, counted up to one more than declared, and their CRC-32."""
+def unpacked(source: Readable, declared: int, path: Path) -> tuple[int, int]:
+    """Number of bytes that a stream unpacks to, counted up to one more than declared, and their CRC-32.
+
+    Raises:
+        BagError: it cannot be unpacked.
+    """
     count, crc, limit = 0, 0, declared + 1
     try:
-        source = _stream(data, compression, path)
         while count < limit and (block := source.read(min(2**20, limit - count))):
             count, crc = count + len(block), zlib.crc32(block, crc)
     except (zstandard.ZstdError, RuntimeError, EOFError, OSError) as error:
@@ -121,7 +124,18 @@ def _inflated(data: bytes, compression: str, declared: int, path: Path) -> tuple
     return count, crc
 
 
-def _stream(data: bytes, compression: str, path: Path) -> Readable:
+def stream_of(data: bytes, compression: str, path: Path) -> Readable:
+    """The stream that unpacks a chunk.
+
+    Args:
+        data: the chunk as stored.
+        compression: ``zstd``, ``lz4``, or empty for none.
+        path: the file, for errors.
+
+    Raises:
+        BagError: another compression.
+        MissingDependencyError: LZ4 is not installed.
+    """
     if not compression:
         return io.BytesIO(data)
     if compression == "zstd":

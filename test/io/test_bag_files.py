@@ -151,15 +151,6 @@ def test_a_message_that_unpacks_without_end_is_refused(tmp_path):
         list(BagReader(path).frames())
 
 
-@pytest.mark.parametrize("name", ["old.bag", "folder/old.bag"])
-def test_a_ros_1_bag_is_told_how_to_convert(tmp_path, name):
-    file = tmp_path / name
-    file.parent.mkdir(exist_ok=True)
-    file.write_bytes(b"#ROSBAG V2.0\n")
-    with pytest.raises(BagError, match=r"ROS 1 bag: convert it with `rosbags-convert --src .*old\.bag --dst"):
-        BagReader(file if name == "old.bag" else file.parent)
-
-
 def test_damaged_metadata_is_named(bag):
     (bag / MANIFEST).unlink()
     (bag / "metadata.yaml").write_text("{[")
