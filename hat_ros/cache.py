@@ -65,7 +65,7 @@ def _read(entry: Path) -> Arrays | None:
             with contextlib.suppress(OSError):  # read-only
                 os.utime(entry)  # says when it was used last
             return arrays
-    except (OSError, ValueError, TypeError, EOFError):  # absent, truncated, or not what we wrote
+    except Exception:  # absent, truncated, or not what we wrote: a damaged header makes its parsers raise anything
         return None
     return None
 

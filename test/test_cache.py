@@ -88,3 +88,33 @@ def test_an_entry_larger_than_the_cache_is_still_read(monkeypatch):
     monkeypatch.setattr(cache, "MAX_BYTES", 10)
     np.testing.assert_array_equal(cached_arrays("thing", "key", build)["a"], build()["a"])
     cached_arrays("thing", "key", forbidden)
+
+
+def test_damaged_headers_are_rebuilt_whatever_they_make_the_parser_raise(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    wanted = np.arange(12.0)
+
+    def get():
+        return cached_arrays("kind", "key", lambda: {"a": wanted})["a"]
+
+    get()
+    (file,) = tmp_path.glob("hat_ros/kind-*/a.npy")
+    whole, rng = file.read_bytes(), np.random.default_rng(5)
+    headers = [
+        b"{'descr': lambda: 0",
+        b"{" * 100,
+        b"{'descr': '<f8', 'fortran_order': 0, 'shape': (10**30,)}",
+        b"((((",
+        b"1e",
+    ]
+    damaged = [whole[:10] + header.ljust(118) + whole[128:] for header in headers]
+    for _ in range(60):
+        data = bytearray(whole)
+        for at in rng.integers(0, 128, 4):
+            data[at] = rng.integers(256)
+        damaged.append(bytes(data))
+    for data in damaged:
+        file.unlink()
+        file.write_bytes(data)
+        np.testing.assert_array_equal(get(), wanted)
+        assert file.read_bytes() == whole or file.read_bytes()[128:] == whole[128:]

@@ -198,6 +198,8 @@ def open_source(
     path = Path(path)
     if not path.exists():
         raise UsageError(f"recording {path}: no such file or folder")
+    if not path.is_dir() and not path.is_file():
+        raise UsageError(f"recording {path}: is neither a file nor a folder (a pipe or a device?)")
     if (path / "labels.json").is_file():
         recording = load_sequence(path)
         return _source_of_images(

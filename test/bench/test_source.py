@@ -2,16 +2,20 @@
 
 import csv
 import json
+import os
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from hat_ros.bench.datasets.pose_files import read_poses
+from hat_ros.bench.datasets.sequence import read_json
 from hat_ros.bench.experiments.comparison import bench_jobs, clips_of_dataset
-from hat_ros.bench.source import SourceSpec
+from hat_ros.bench.source import SourceSpec, open_source
 from hat_ros.bench.synth.models import write_model
 from hat_ros.cli import main
-from hat_ros.errors import DatasetError, UsageError
+from hat_ros.errors import DatasetError, InputError, UsageError
 
 
 @pytest.fixture
@@ -127,3 +131,32 @@ def test_shirt_regions_come_from_its_labels(tmp_path):
     assert next(source.frames(masks=False)).given_mask is None
     ((stamp_ns, mask),) = source.masks()
     assert stamp_ns == frame.stamp_ns and np.array_equal(mask, frame.given_mask)
+
+
+@pytest.mark.parametrize("name", ["/etc/hostname", "../secret.png", "a/../../secret.png", "a\0b.png"])
+@pytest.mark.parametrize("key", ["image", "mesh"])
+def test_labels_must_not_lead_out_of_their_folder(tmp_path, name, key):
+    clip = tmp_path / "clip"
+    (clip / "images").mkdir(parents=True)
+    (tmp_path / "secret.png").write_bytes(b"x")
+    write_model("cubesat", clip / "target.glb")
+    labels = {
+        "K": [[100, 0, 50], [0, 100, 50], [0, 0, 1]],
+        "size": [100, 100],
+        "mesh": name if key == "mesh" else "target.glb",
+        "frames": [{"file": name}],
+    }
+    (clip / "labels.json").write_text(json.dumps(labels))
+    with pytest.raises(DatasetError, match="leads out of"):
+        open_source(clip)
+
+
+def test_pipes_and_devices_are_refused_at_once(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/zero")):
+        with pytest.raises(UsageError, match="neither a file nor a folder"):
+            open_source(path)
+        with pytest.raises(InputError, match="is not a file"):
+            read_poses(path)
+        with pytest.raises(DatasetError, match="is not a file"):
+            read_json(path)

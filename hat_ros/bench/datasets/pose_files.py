@@ -62,6 +62,8 @@ def read_poses(path: Path, scene: tuple[int, int] | None = None) -> ExternalPose
 
 
 def _read_text(path: Path) -> str:
+    if path.exists() and not path.is_file():
+        raise InputError(f"poses {path}: is not a file")
     try:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

@@ -40,7 +40,7 @@ def load_sequence(folder: str | Path) -> ImageRecording:
     if not isinstance(labels, dict) or not isinstance(labels.get("frames"), list) or not labels["frames"]:
         raise DatasetError(f"{labels_path}: expected a mapping with a non-empty list 'frames'")
     camera = _camera(labels, labels_path)
-    mesh = folder / str(labels.get("mesh", ""))
+    mesh = named_in(folder, str(labels.get("mesh", "")), f"{labels_path}: 'mesh'")
     if not mesh.is_file():
         raise DatasetError(f"{labels_path}: the CAD model 'mesh' names {mesh.name!r}, which is not in the folder")
     scale = labels.get("scale", 1.0)
@@ -81,6 +81,8 @@ def read_json(path: Path) -> Any:
     Raises:
         DatasetError: missing or malformed.
     """
+    if path.exists() and not path.is_file():
+        raise DatasetError(f"{path}: is not a file")
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -89,11 +91,22 @@ def read_json(path: Path) -> Any:
         raise DatasetError(f"{path}: not valid JSON ({error})") from None
 
 
+def named_in(folder: Path, name: str, where: str) -> Path:
+    """The file of a folder that a label names; it is copied into bags, so it must not lead out of the folder.
+
+    Raises:
+        DatasetError: an absolute path, or one with ``..``.
+    """
+    if Path(name).is_absolute() or ".." in Path(name).parts or "\0" in name:
+        raise DatasetError(f"{where}: {name[:80]!r} leads out of {folder}: name a file in that folder")
+    return folder / name
+
+
 def _camera(labels: dict[str, Any], path: Path) -> Camera:
     try:
         width, height = (int(value) for value in labels["size"])
         return Camera(np.array(labels["K"], dtype=np.float64), width, height)
-    except (KeyError, TypeError, ValueError, FrameError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, FrameError) as error:
         raise DatasetError(f"{path}: 'K' must be 3x3 and 'size' [width, height] ({error})") from None
 
 
@@ -101,7 +114,7 @@ def _file(folder: Path, labels_path: Path, entry: Any, index: int) -> ImageFile:
     where = f"{labels_path}, frame {index}"
     if not isinstance(entry, dict) or not isinstance(entry.get("file"), str):
         raise DatasetError(f"{where}: expected a mapping with 'file'")
-    image = folder / "images" / entry["file"]
+    image = named_in(folder / "images", entry["file"], where)
     if not image.is_file():
         raise DatasetError(f"{where}: image {image.name!r} is not in the folder 'images'")
     T_cam_target = None

@@ -17,7 +17,7 @@ import numpy as np
 
 from hat_ros.array_types import Float
 from hat_ros.bench.datasets.image_files import ImageFile, ImageRecording, camera_from_label, pose_from_label, stamp_of
-from hat_ros.bench.datasets.sequence import read_json
+from hat_ros.bench.datasets.sequence import named_in, read_json
 from hat_ros.errors import DatasetError
 
 TRAJECTORIES = ("roe1", "roe2")
@@ -82,7 +82,7 @@ def _files(trajectory: Path, images: Path) -> list[ImageFile]:
         where = f"{path}, entry {index}"
         if not isinstance(entry, dict) or not isinstance(entry.get("filename"), str):
             raise DatasetError(f"{where}: expected a mapping with 'filename'")
-        image = images / entry["filename"]
+        image = named_in(images, entry["filename"], where)
         if not image.is_file():
             raise DatasetError(f"{where}: image {image} does not exist")
         pose = pose_from_label(entry.get("q_vbs2tango_true"), entry.get("r_Vo2To_vbs_true"), "wxyz", where)

@@ -11,6 +11,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from hat_ros.bench.datasets.image_files import ImageFile, ImageRecording, camera_from_label, pose_from_label, stamp_of
+from hat_ros.bench.datasets.sequence import named_in
 from hat_ros.errors import DatasetError
 
 SIZE = (1440, 1080)
@@ -39,7 +40,7 @@ def open_spark(root: Path, model: Path | None = None, sequences: Collection[str]
             continue
         files = []
         for index, (line, row) in enumerate(sorted(rows[name], key=lambda item: item[1]["filename"])):
-            image = root / "images" / name / row["filename"]
+            image = named_in(root / "images", f"{name}/{row['filename']}", f"{path}, line {line}")
             if not image.is_file():
                 raise DatasetError(f"{path}, line {line}: image {image} does not exist")
             quat, translation = [row[c] for c in _COLUMNS[5:]], [row[c] for c in _COLUMNS[2:5]]
