@@ -7,13 +7,14 @@ import pytest
 from camera_info import info, through_lens
 from graph_clip import FIRST_NS, STEP_NS, said, stamps
 
+from hat_ros.bench.evaluation.metrics import pose_errors
 from hat_ros.bench.source import open_source
 from hat_ros.config import config_from_dict, config_to_dict
 from hat_ros.errors import FrameError
 from hat_ros.io import topics
 from hat_ros.io.bag_writer import BagWriter
 from hat_ros.io.messages import Wire
-from hat_ros.io.result_bag import ResultBagWriter
+from hat_ros.io.result_bag import ResultBagWriter, read_result_bag
 from hat_ros.io.rosbag import TYPESTORE
 from hat_ros.ros.graph import replay
 from hat_ros.tracker import HatTracker
@@ -105,3 +106,21 @@ def test_the_option_rectified_holds_in_the_graph_as_in_one_process(raw_bag, spec
         assert found[topic] == early, topic
     camera = open_source(raw_bag, camera_config=config.camera).recording.camera
     assert camera.K[0, 0] == pytest.approx(share * spec.focal_px)
+
+
+def errors_of(bag, clip, config, out):
+    """E_p of the first frames by stamp."""
+    in_process(bag, config, out, 0)
+    log = read_result_bag(out)
+    index = ((log.stamp_ns - FIRST_NS) // STEP_NS).astype(int)
+    errors = pose_errors(log.T_est, np.array([clip[i].T_cam_target for i in index])).pose
+    return {i: error for i, error in zip(index, errors, strict=True) if i < N and i != UNREADABLE}
+
+
+def test_poses_of_the_raw_recording_are_as_good_as_those_of_the_pinhole_camera(
+    raw_bag, clean_bag, clip, config, tmp_path
+):
+    raw = errors_of(raw_bag, clip, config, tmp_path / "raw")
+    clean = errors_of(clean_bag, clip, config, tmp_path / "clean")
+    assert raw.keys() == clean.keys()
+    assert np.mean(list(raw.values())) < 0.02 + np.mean(list(clean.values()))
