@@ -9,7 +9,9 @@ from __future__ import annotations
 import heapq
 import io
 import re
+import shutil
 import tempfile
+import weakref
 from collections.abc import Collection, Generator, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
@@ -93,9 +95,12 @@ class BagFiles:
     def __init__(self, path: Path) -> None:
         self._path = path
         files = bag_files(path)
-        # What must be unpacked or converted first lies there, and goes with this object.
-        self._made = tempfile.TemporaryDirectory(prefix="hat_bag_")
-        self._storages = [_storage(file, Path(self._made.name)) for file in files]
+        scratch = path
+        if any(file.suffix in (".zstd", _ROS1_SUFFIX) for file in files):
+            # What is unpacked or converted first lies there, and goes with this object.
+            scratch = Path(tempfile.mkdtemp(prefix="hat_bag_"))
+            weakref.finalize(self, shutil.rmtree, scratch, ignore_errors=True)
+        self._storages = [_storage(file, scratch) for file in files]
         self.topics: dict[str, Topic] = {}
         with damage_as_bag_error(path):
             for topic in (topic for storage in self._storages for topic in storage.topics()):

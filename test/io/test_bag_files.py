@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import json
+import tempfile
 
 import numpy as np
 import pytest
@@ -115,14 +117,17 @@ def packed(data):
 
 @pytest.mark.parametrize("with_metadata", [True, False])
 @pytest.mark.parametrize("suffix", ["mcap", "db3"])
-def test_files_compressed_as_a_whole_are_read(tmp_path, suffix, with_metadata):
+def test_files_compressed_as_a_whole_are_read(tmp_path, monkeypatch, suffix, with_metadata):
     bag = of_others(tmp_path / "bag", StoragePlugin.MCAP if suffix == "mcap" else StoragePlugin.SQLITE3)
     file = next(bag.glob(f"*.{suffix}"))
     file.with_name(f"{file.name}.zstd").write_bytes(packed(file.read_bytes()))
     file.unlink()
     if not with_metadata:
         (bag / "metadata.yaml").unlink()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     assert stamps_of(bag) == ALL
+    gc.collect()
+    assert list(tmp_path.iterdir()) == [bag], "what was unpacked is gone"
 
 
 def of_others(path, plugin, change=bytes):
