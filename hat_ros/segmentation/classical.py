@@ -1,7 +1,8 @@
 """Segmentation without weights: ``segmentation.backend: classical``.
 
 Before black sky a threshold finds what is lit (:mod:`hat_ros.segmentation.lit`), after stray light has been taken off
-(:mod:`hat_ros.segmentation.glow`). Before anything else (Earth, clouds, a laboratory) a graph cut separates the target,
+(:mod:`hat_ros.segmentation.glow`) and borders without data have been filled (:mod:`hat_ros.segmentation.no_data`).
+Before anything else (Earth, clouds, a laboratory) a graph cut separates the target,
 seeded by the previous mask and by the silhouette of the predicted pose, or from nothing
 (:mod:`hat_ros.segmentation.textured`). What it says is checked against the CAD model's silhouettes and against how the
 background moves, and a tracked mask now and then against an independent search, so that a wrong mask does not keep
@@ -17,6 +18,7 @@ from hat_ros.geometry.masks import overlap
 from hat_ros.segmentation.glow import look_into_space
 from hat_ros.segmentation.lit import LitBody
 from hat_ros.segmentation.masks import Mask, enlarge
+from hat_ros.segmentation.no_data import with_sky_in_borders
 from hat_ros.segmentation.shape import SilhouetteBank
 from hat_ros.segmentation.textured import TexturedBackground
 from hat_ros.target.model import Target
@@ -57,13 +59,14 @@ class ClassicalSegmenter:
         silhouette = self._silhouette(frame, prior)
         supported = prior is not None and prior.supported
         certain = prior is not None and prior.healthy  # what is dark is added only where the basin is beyond doubt
-        space = look_into_space(frame.rgb, self._config.sky_border_share)
+        rgb = with_sky_in_borders(frame.rgb)
+        space = look_into_space(rgb, self._config.sky_border_share)
         mask = None
         if space is not None and space.regions:
             mask = self._lit.find(space.sky, space.regions, self._masks[1], silhouette if certain else None)
         lit = mask is not None
         if mask is None and (space is None or space.regions):
-            mask = self._textured.find(frame.rgb, self._masks, silhouette, supported)
+            mask = self._textured.find(rgb, self._masks, silhouette, supported)
         if mask is not None and (not mask.any() or (certain and self._leaps(mask, silhouette, lit))):
             mask = None
         self._masks = (self._masks[1], mask)
