@@ -42,7 +42,7 @@ def cached_arrays(kind: str, key: str, build: Callable[[], Mapping[str, NDArray]
         key: everything that the content depends on, format version included.
         build: makes named arrays; called when the entry is absent or damaged.
     """
-    entry = cache_folder() / f"{kind}-{hashlib.sha256(key.encode()).hexdigest()[:32]}"
+    entry = _entry(kind, key)
     stored = _read(entry)
     if stored is not None:
         return stored
@@ -51,6 +51,15 @@ def cached_arrays(kind: str, key: str, build: Callable[[], Mapping[str, NDArray]
     stored = _read(entry)  # before another process may find the cache too large
     _trim(entry.parent, keep=entry)
     return stored or arrays
+
+
+def discard(kind: str, key: str) -> None:
+    """Delete an entry that is no longer needed, if it is there; who has it mapped keeps the arrays."""
+    shutil.rmtree(_entry(kind, key), ignore_errors=True)
+
+
+def _entry(kind: str, key: str) -> Path:
+    return cache_folder() / f"{kind}-{hashlib.sha256(key.encode()).hexdigest()[:32]}"
 
 
 def _digest(array: NDArray) -> str:

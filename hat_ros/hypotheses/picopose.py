@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+from functools import partial
 
 import cv2
 import numpy as np
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from hat_ros.array_types import Float, Float32, Int
-from hat_ros.cache import cached_arrays
+from hat_ros.cache import cached_arrays, discard
 from hat_ros.config import HatConfig, PicoPoseConfig
 from hat_ros.geometry import lie
 from hat_ros.hypotheses.picopose_templates import (
@@ -60,21 +61,26 @@ class PicoPoseHypotheses:
         self._load_templates(target, weights)
 
     def _load_templates(self, target: Target, weights: str) -> None:
-        arrays = cached_arrays("picopose", f"{_FORMAT}:{target.sha256}:{weights}", lambda: self._build(target))
+        key = f"{_FORMAT}:{target.sha256}:{weights}"
+        parts: list[str] = []
+        arrays = cached_arrays("picopose", key, lambda: self._build(target, key, parts))
+        for part in parts:  # the whole is stored now
+            discard("picopose_part", part)
         tensor = self._runtime.tensor
         self._lower_levels = [arrays[f"features{i}"] for i in range(len(pp.FEATURE_BLOCKS) - 1)]
         self._matching = tensor(arrays["features3"])
         self._masks, self._M, self._T = tensor(arrays["masks"]), tensor(arrays["M"]), tensor(arrays["T_cam_target"])
         self._points_m = np.array(arrays["points_m"])
 
-    @torch.inference_mode()
-    def _build(self, target: Target) -> dict[str, NDArray]:
+    def _build(self, target: Target, key: str, parts: list[str]) -> dict[str, NDArray]:
+        """Encode all templates, batch by batch into the cache, so that a run that is stopped keeps what it has done."""
         templates: Templates = render_templates(target)
         levels: list[list[NDArray]] = [[] for _ in pp.FEATURE_BLOCKS]
         for batch in self._runtime.batches(len(templates.crops), self._settings.batch_size):
-            crops = pp.normalise_crops(self._runtime.tensor(templates.crops[batch]))
-            for level, features in zip(levels, self._extract(crops), strict=True):
-                level.append(features.float().cpu().numpy())
+            parts.append(f"{key}:{batch.start}:{batch.stop}")
+            part = cached_arrays("picopose_part", parts[-1], partial(self._encode, templates.crops[batch]))
+            for i, level in enumerate(levels):
+                level.append(part[f"features{i}"])
             LOG.info("encoded %d of %d templates, once per CAD model and checkpoint", batch.stop, len(templates.crops))
         out = {f"features{i}": np.concatenate(level) for i, level in enumerate(levels)}
         masks = pp.patch_mask(torch.from_numpy(templates.masks)).numpy()
@@ -83,6 +89,12 @@ class PicoPoseHypotheses:
             | {"masks": masks, "M": templates.M, "T_cam_target": templates.T_cam_target}
             | {"points_m": templates.points_m}
         )
+
+    @torch.inference_mode()
+    def _encode(self, crops: NDArray) -> dict[str, NDArray]:
+        """Features of (N, 3, H, W) template crops, by level."""
+        features = self._extract(pp.normalise_crops(self._runtime.tensor(crops)))
+        return {f"features{i}": level.float().cpu().numpy() for i, level in enumerate(features)}
 
     @torch.inference_mode()
     def generate(self, frame: Frame, detection: Detection, prior: PosePrior | None) -> Candidates:
