@@ -7,6 +7,7 @@ right is one sentence on stderr; a traceback is a bug.
 from __future__ import annotations
 
 import argparse
+import errno
 import signal
 import sys
 import threading
@@ -16,10 +17,12 @@ from types import FrameType
 
 from hat_ros import __version__
 from hat_ros.cli import analyse, bench, config, data, run, system
-from hat_ros.errors import HatError, InputError
+from hat_ros.errors import HatError, InputError, RunError
 
 EXIT_INTERRUPTED = 130
 EXIT_TERMINATED = 143
+# Not what a program can foresee: rights, read-only and full disks.
+_OF_THE_MACHINE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT)
 
 _EPILOG = """\
 examples:
@@ -92,6 +95,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # `hat ... | head`
         sys.stderr.close()
         return 1
+    except OSError as error:
+        if error.errno not in _OF_THE_MACHINE or error.filename is None:
+            raise
+        print(f"hat: {error.filename}: {error.strerror}: choose a place that can be read and written", file=sys.stderr)
+        return RunError.exit_code
 
 
 if __name__ == "__main__":

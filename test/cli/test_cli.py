@@ -1,5 +1,6 @@
 """The command line: exit codes, one sentence, no traceback, true help, light start."""
 
+import errno
 import json
 import os
 import re
@@ -327,3 +328,23 @@ def test_another_word_for_the_camera_is_bad_input(words, capsys):
         main(["track", "bag", "--out", "out", *words])
     assert stopped.value.code == 2
     assert "must be one of auto" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EROFS, errno.ENOSPC])
+def test_a_place_that_cannot_be_written_is_one_sentence(monkeypatch, capsys, number):
+    def fails(arguments):
+        raise OSError(number, os.strerror(number), "/mnt/cdrom/out.json")
+
+    monkeypatch.setattr("hat_ros.cli.system._doctor", fails)
+    assert main(["doctor"]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "/mnt/cdrom/out.json" in said and os.strerror(number) in said
+
+
+def test_other_errors_of_the_system_are_bugs_of_ours(monkeypatch):
+    def fails(arguments):
+        raise OSError(errno.EBADF, "Bad file descriptor", "x")
+
+    monkeypatch.setattr("hat_ros.cli.system._doctor", fails)
+    with pytest.raises(OSError, match="Bad file"):
+        main(["doctor"])
