@@ -35,7 +35,7 @@ FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
 BENCH_FLOORS = (
     ("datasets",),
     ("synth", "source", "observations"),
-    ("evaluation",),
+    ("evaluation", "check", "check_picture"),
     ("methods",),
     ("runs",),
     ("experiments",),
