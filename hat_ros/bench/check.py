@@ -31,6 +31,8 @@ from hat_ros.types import Camera, Frame
 
 # A step of more than so many usual ones is a gap.
 _GAP_STEPS = 1.5
+# Masks of another size than the CAD model at the true pose, by this factor, are no matter of occlusion.
+_UNLIKE = 3.0
 # Pixels between those that are looked at for black and saturated ones.
 _STRIDE = 4
 _GREY = 160
@@ -224,7 +226,8 @@ def frame_lines(found: Frames, source: Source) -> Iterator[Line]:
 
 
 def _stamp_lines(stamps_ns: Int) -> Iterator[Line]:
-    steps, forward = np.diff(stamps_ns), np.diff(np.unique(stamps_ns)) * 1e-9
+    ordered = np.unique(stamps_ns)
+    steps, forward = stamps_ns[1:] - stamps_ns[:-1], 1e-9 * (ordered[1:] - ordered[:-1])
     if not len(forward):
         return
     usual = float(np.median(forward))
@@ -236,12 +239,10 @@ def _stamp_lines(stamps_ns: Int) -> Iterator[Line]:
 
 
 def _size_lines(found: Frames, source: Source) -> Iterator[Line]:
-    sizes, origin = found.sizes_px, "given masks"
-    camera, target = source.recording.camera, source.target
-    if not sizes:
-        origin, truth = "ground truth", source.truth_rows()
-        rows = {stamp: truth[stamp] for stamp in found.stamps_ns if stamp in truth}
-        sizes = {stamp: _projected_px(row, camera, target) for stamp, row in rows.items() if row[2] > 0}
+    camera, target, truth = source.recording.camera, source.target, source.truth_rows()
+    rows = {stamp: truth[stamp] for stamp in found.stamps_ns if stamp in truth}
+    projected = {stamp: _projected_px(row, camera, target) for stamp, row in rows.items() if row[2] > 0}
+    sizes, origin = (found.sizes_px, "given masks") if found.sizes_px else (projected, "ground truth")
     if not sizes:
         yield "target in the image", "unknown: neither masks nor ground truth are given"
         return
@@ -251,6 +252,13 @@ def _size_lines(found: Frames, source: Source) -> Iterator[Line]:
     yield "target in the image", f"{values.min():.0f} to {values.max():.0f} px, over time {over} px (by {origin})"
     near, far = camera.K[0, 0] * target.diameter_m / np.array([values.max(), values.min()])
     yield "range by size", f"at most {near:.3g} m where it is largest, {far:.3g} m where it is smallest: check the unit"
+    ratios = [found.sizes_px[stamp] / projected[stamp] for stamp in found.sizes_px if projected.get(stamp)]
+    if ratios and not 1 / _UNLIKE <= np.median(ratios) <= _UNLIKE:
+        yield (
+            "warning",
+            f"the given masks are {np.median(ratios):.3g} times as large as the CAD model at the true poses: check "
+            f"unit_scale and the calibration",
+        )
 
 
 def _projected_px(row: Float, camera: Camera, target: Target) -> float:

@@ -83,6 +83,16 @@ def test_size_comes_from_the_truth_where_there_are_no_masks(tmp_path):
     assert unknown["target in the image"].startswith("unknown")
 
 
+def test_masks_that_the_cad_model_does_not_fill_are_warned_of(tmp_path):
+    bag = write_bag(tmp_path / "bag", range(3))
+    assert "warning" not in told(open_source(bag))
+    (bag / "manifest.json").unlink()
+    named = (bag / "target.yaml").read_text().splitlines()
+    changed = ["unit_scale: 0.1" if line.startswith("unit_scale") else line for line in named]
+    (bag / "target.yaml").write_text("\n".join(changed))
+    assert "times as large as the CAD model" in told(open_source(bag))["warning"]
+
+
 def test_clip_and_its_grey_levels(tmp_path):
     lines = told(open_source(write_clip(tmp_path / "clip")))
     assert lines["encoding"] == ".png (4)"
