@@ -219,7 +219,7 @@ def frame_lines(found: Frames, source: Source) -> Iterator[Line]:
     yield from _stamp_lines(np.array(found.stamps_ns, dtype=np.int64))
     yield "encoding", ", ".join(f"{name} ({count})" for name, count in found.encodings.items()) or "-"
     if not found.shown:
-        raise FrameError(f"{source.path}: no frame can be used: {found.refusals or 'the recording has none'}")
+        raise FrameError(f"{source.path}: no frame can be used: {str(found.refusals) or 'the recording has none'}")
     yield "black pixels", f"{np.mean(found.black):.1%}, at most {np.max(found.black):.1%}"
     yield "saturated pixels", f"{np.mean(found.saturated):.1%}, at most {np.max(found.saturated):.1%}"
     yield from _size_lines(found, source)
@@ -241,7 +241,8 @@ def _stamp_lines(stamps_ns: Int) -> Iterator[Line]:
 def _size_lines(found: Frames, source: Source) -> Iterator[Line]:
     camera, target, truth = source.recording.camera, source.target, source.truth_rows()
     rows = {stamp: truth[stamp] for stamp in found.stamps_ns if stamp in truth}
-    projected = {stamp: _projected_px(row, camera, target) for stamp, row in rows.items() if row[2] > 0}
+    every = {stamp: _projected_px(row, camera, target) for stamp, row in rows.items()}
+    projected = {stamp: size for stamp, size in every.items() if size > 0}
     sizes, origin = (found.sizes_px, "given masks") if found.sizes_px else (projected, "ground truth")
     if not sizes:
         yield "target in the image", "unknown: neither masks nor ground truth are given"
@@ -262,6 +263,7 @@ def _size_lines(found: Frames, source: Source) -> Iterator[Line]:
 
 
 def _projected_px(row: Float, camera: Camera, target: Target) -> float:
+    """Largest side of the box about the CAD model at a pose row (7,); 0 where some of it is not before the camera."""
     T = lie.matrix_from_row(row)
     points = target.hull_m @ T[:3, :3].T + T[:3, 3]
-    return float(np.ptp(camera.project(points[points[:, 2] > 0]), axis=0).max())
+    return 0.0 if points[:, 2].min() <= 0 else float(np.ptp(camera.project(points), axis=0).max())

@@ -8,10 +8,11 @@ import pytest
 import trimesh
 from scripted import CAMERA, frame, mask, stamp, true_row
 
-from hat_ros.bench.check import frame_lines, notes, read_frames, recording_lines
+from hat_ros.bench.check import Frames, frame_lines, notes, read_frames, recording_lines
 from hat_ros.bench.source import open_source
 from hat_ros.bench.synth.models import write_model
 from hat_ros.cli import main
+from hat_ros.errors import FrameError
 from hat_ros.geometry import lie
 from hat_ros.io.bag_writer import BagWriter
 from hat_ros.target.loading import load_target
@@ -25,16 +26,20 @@ class AsWritten(BagWriter):
         super().write_cdr(topic, kind, data, self.count)
 
 
-def write_bag(folder, indices, masks=True, truth=True):
+def write_bag(folder, indices, masks=True, truth=True, pose=lambda i: lie.matrix_from_row(true_row(i))):
     model = folder.parent / "cubesat.glb"
     write_model("cubesat", model)
     with AsWritten(folder, image_format="png") as writer:
         for i in indices:
             given = mask().astype(np.uint8) * np.uint8(255) if masks else None
-            T = lie.matrix_from_row(true_row(i)) if truth else None
+            T = pose(i) if truth else None
             writer.write_frame(stamp(i), frame(i).rgb, CAMERA, mask=given, T_cam_target=T)
         writer.write_target(model)
     return folder
+
+
+def behind(index):
+    return lie.transform(np.eye(3), np.array([0.0, 0.0, -5.0 - index]))
 
 
 def write_clip(folder, count=4, size=(64, 48)):
@@ -104,6 +109,16 @@ def test_clip_and_its_grey_levels(tmp_path):
 def test_limit_leaves_the_rest_unread(tmp_path):
     found = read_frames(open_source(write_clip(tmp_path / "clip")), 2)
     assert len(found.stamps_ns) == 2 and sum(found.encodings.values()) == 2
+
+
+def test_recording_without_frames_cannot_run(tmp_path):
+    with pytest.raises(FrameError, match="the recording has none"):
+        list(frame_lines(Frames(), open_source(write_clip(tmp_path / "clip"))))
+
+
+def test_poses_behind_the_camera_have_no_size(tmp_path):
+    bag = open_source(write_bag(tmp_path / "bag", range(2), masks=False, pose=behind))
+    assert told(bag)["target in the image"].startswith("unknown")
 
 
 def test_what_is_logged_becomes_lines(tmp_path):
