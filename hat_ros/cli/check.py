@@ -48,7 +48,7 @@ def _check(arguments: argparse.Namespace) -> int:
     from hat_ros.errors import UsageError
 
     out: Path | None = arguments.out
-    if out is not None and (out.suffix.lower() != ".png" or out.is_dir() or not out.parent.is_dir()):
+    if out is not None and (out.suffix.lower() != ".png" or not out.parent.is_dir()):
         raise UsageError(f"--out {out}: name a file that ends in .png, in a folder that exists")
     lines: list[Line] = []
     try:
@@ -100,10 +100,18 @@ def _look(arguments: argparse.Namespace, lines: list[Line], out: Path | None) ->
             lines.extend(check.cad_lines(recording.target_path, target, scale))
         shown = found.shown
     if out is not None:
-        import cv2
-
         from hat_ros.bench.check_picture import picture
 
-        rgb = picture(target, shown)
-        out.write_bytes(cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1].tobytes())
+        _write_picture(out, picture(target, shown))
         lines.append(("picture", str(out)))
+
+
+def _write_picture(out: Path, rgb: UInt8) -> None:
+    import cv2
+
+    from hat_ros.errors import RunError
+
+    try:
+        out.write_bytes(cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1].tobytes())
+    except OSError as error:
+        raise RunError(f"--out {out}: {error.strerror}: choose a place that can be written") from None

@@ -164,3 +164,12 @@ def test_what_cannot_run_is_one_sentence_and_exit_code_2(tmp_path, capsys, words
     write_bag(tmp_path / "late", [-10])
     assert main(["check", *(word.format(tmp=tmp_path) for word in words)]) == 2
     assert sentence in capsys.readouterr().err.strip().splitlines()[-1]
+
+
+@pytest.mark.parametrize("name", ["folder.png", f"{'x' * 300}.png"])
+def test_picture_that_cannot_be_written_is_one_sentence(tmp_path, capsys, name):
+    (tmp_path / "folder.png").mkdir()
+    assert main(["check", str(write_clip(tmp_path / "clip")), "--out", str(tmp_path / name)]) == 1
+    said = capsys.readouterr()
+    assert "choose a place that can be written" in said.err
+    assert "target in the image" in said.out
