@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 PYTEST := ROS_PYTHON_CHECK_FIELDS=1 $(BIN)/python -m pytest
 
-.PHONY: help demo test test-accuracy test-slow test-gpu mutation lint types count docs wheel-check wheel-oldest \
+.PHONY: help demo test test-accuracy test-slow test-gpu mutation fuzz lint types count docs wheel-check wheel-oldest \
   wheel-newest colcon-check install install-nets install-test clean
 .DELETE_ON_ERROR:
 
@@ -29,6 +29,9 @@ test-gpu: install-test  ## tests that need an accelerator
 
 mutation: install-test  ## does the accuracy gate see changed constants? stage by stage, an hour
 	$(BIN)/python tools/mutate.py
+
+fuzz: install-test  ## every reader with changed inputs: HAT_FUZZ_CASES=10000 for each, HAT_FUZZ_SEED=1
+	HAT_FUZZ_CASES=$${HAT_FUZZ_CASES:-10000} $(PYTEST) -s test/fuzz
 
 lint: install-test  ## ruff: rules and format
 	$(BIN)/ruff check .

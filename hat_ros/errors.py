@@ -7,11 +7,23 @@ and exits with :attr:`HatError.exit_code`; nothing else is caught there, so a tr
 
 from __future__ import annotations
 
+MAX_SENTENCE = 1800
+
 
 class HatError(Exception):
-    """Base of all errors that the user can put right."""
+    """Base of all errors that the user can put right.
+
+    Args:
+        sentence: what was wrong. Inputs are quoted in it, so line breaks become blanks, and of a long one the middle is
+            left out: the field stands at its beginning, the advice at its end.
+    """
 
     exit_code = 1
+
+    def __init__(self, sentence: str) -> None:
+        line = " ".join(sentence.splitlines())
+        half = MAX_SENTENCE // 2
+        super().__init__(line if len(line) <= MAX_SENTENCE else f"{line[:half]} ... {line[-half:]}")
 
 
 class InputError(HatError):

@@ -158,7 +158,8 @@ def is_rigid(T: Float, tolerance: float = 1e-4) -> Bool:
     T = np.asarray(T, dtype=np.float64)
     finite = np.asarray(np.isfinite(T).all(axis=(-1, -2)))
     safe = np.where(finite[..., None, None], T, np.eye(4))
-    R = safe[..., :3, :3]
+    # No entry of a rotation exceeds 1; squares of larger ones could overflow.
+    R = np.clip(safe[..., :3, :3], -2.0, 2.0)
     orthogonal = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(-1, -2)) < tolerance
     last = np.abs(safe[..., 3, :] - np.array([0.0, 0.0, 0.0, 1.0])).max(axis=-1) < tolerance
     return finite & orthogonal & last & (np.linalg.det(R) > 0)

@@ -181,7 +181,7 @@ def _listed(folder: Path) -> list[Path]:
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
         names = [PurePath(str(name)).name for name in content["rosbag2_bagfile_information"]["relative_file_paths"]]
-    except (yaml.YAMLError, ValueError, KeyError, TypeError, RecursionError):
+    except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError):
         raise BagError(f"{path} is damaged: delete it, the bag's files are read without it") from None
     # Of a bag compressed as a whole, some versions list the names before compression.
     return [folder / name if (folder / name).exists() else _with_zstd(folder / name) for name in names]

@@ -6,6 +6,7 @@ manifest. No ROS is needed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -227,7 +228,7 @@ class BagReader:
         out: dict[int, Float] = {}
         for message in self.messages(self.truth_topic) if self.truth_topic else ():
             row = messages.pose_row_from(message.pose)
-            if not np.isfinite(row).all() or abs(np.linalg.norm(row[3:]) - 1) > 1e-3:
+            if not np.isfinite(row).all() or abs(math.hypot(*row[3:]) - 1) > 1e-3:
                 raise BagError(
                     f"{self.path}: true pose at stamp {messages.stamp_of(message)} is no pose: {row.tolist()}"
                 )

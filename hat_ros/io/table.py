@@ -7,6 +7,7 @@ Names, order, types and sizes are checked; anything else is a :class:`~hat_ros.e
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -116,5 +117,5 @@ def check_poses(pose_rows: Float) -> None:
         WireError: not finite, or the quaternion is not of unit length.
     """
     for row in pose_rows.reshape(-1, 7):
-        if not np.isfinite(row).all() or abs(np.linalg.norm(row[3:]) - 1.0) > 1e-6:
+        if not np.isfinite(row).all() or abs(math.hypot(*row[3:]) - 1.0) > 1e-6:
             raise WireError(f"a pose must be finite with a unit quaternion, found {row.tolist()}")

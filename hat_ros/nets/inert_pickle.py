@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import collections
 import pickle
+import pickletools
 import types
-from typing import Any
+from typing import IO, Any
 
 import torch
+
+# Objects in one file; the largest public checkpoints have some thousands.
+_MAX_MEMO = 10_000_000
 
 
 class _Placeholder:
@@ -35,6 +39,19 @@ class _Placeholder:
         """Accept list items of an unknown list subclass."""
 
 
+def _check_memo(stream: IO[bytes]) -> None:
+    """Refuse a pickle that numbers its objects absurdly: for a few bytes the reader would fill up to 64 GiB.
+
+    Raises:
+        pickle.UnpicklingError: a number above ``_MAX_MEMO``.
+    """
+    start = stream.tell()
+    for code, value, _ in pickletools.genops(stream):
+        if code.name in ("PUT", "LONG_BINPUT") and isinstance(value, int) and value > _MAX_MEMO:
+            raise pickle.UnpicklingError(f"object number {value} is too large")
+    stream.seek(start)
+
+
 def inert_pickle() -> types.ModuleType:
     """A stand-in for :mod:`pickle` whose reader resolves tensors and plain containers, and nothing else."""
     allowed: dict[tuple[str, str], Any] = {
@@ -46,6 +63,10 @@ def inert_pickle() -> types.ModuleType:
     }
 
     class Unpickler(pickle.Unpickler):
+        def __init__(self, stream: IO[bytes], **options: Any) -> None:
+            _check_memo(stream)
+            super().__init__(stream, **options)
+
         # torch answers for its storage types itself before it asks here.
         def find_class(self, module: str, name: str) -> Any:
             return allowed.get((module, name), _Placeholder)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+import os
 import re
 import shutil
 from collections.abc import Iterator, Sequence
@@ -88,7 +89,7 @@ class Companions(Resolver):
             if place.is_absolute() or ".." in place.parts or re.match(r"[A-Za-z]:|\\\\", candidate):
                 return None, "does not lie in the folder of the model; put it there and name it without a path"
             path = self._folder / place
-            if not path.is_file():
+            if not os.path.isfile(path):  # Path.is_file raises for names that are too long
                 continue
             if self._folder not in path.resolve().parents:
                 return None, "is a link out of the folder of the model"

@@ -5,12 +5,14 @@ from __future__ import annotations
 import io
 import json
 import logging
+import os
 import re
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import trimesh
 
 from hat_ros.config.yaml_text import read_yaml
@@ -71,7 +73,7 @@ def companions_of(path: Path) -> dict[str, Path]:
     """What a mesh names and has beside it: path relative to the mesh's folder -> file; errors of :func:`read_scene`."""
     marks = {".obj": b"mtllib", ".ply": b"TextureFile", ".glb": b'"uri"'}
     # Large models are read once more only if they name anything.
-    is_named = path.suffix.lower() in marks and path.is_file() and marks[path.suffix.lower()] in path.read_bytes()
+    is_named = path.suffix.lower() in marks and os.path.isfile(path) and marks[path.suffix.lower()] in path.read_bytes()
     return _read(path)[1].found if is_named else {}
 
 
@@ -102,7 +104,7 @@ def _read(path: Path) -> tuple[trimesh.Scene, Companions]:
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise MeshError(f"CAD model {path.name}: format '{suffix}' is not supported, give {', '.join(MESH_SUFFIXES)}")
-    if not path.is_file():
+    if not os.path.isfile(path):  # Path.is_file raises for names that are too long
         raise MeshError(f"CAD model {path}: no such file")
     size = path.stat().st_size
     if not 0 < size <= MAX_FILE_BYTES:
@@ -121,7 +123,8 @@ def _read(path: Path) -> tuple[trimesh.Scene, Companions]:
     files = Companions(path, libraries)
     file_type = "glb" if suffix in BREP_SUFFIXES else suffix[1:]
     try:
-        with _silent_trimesh():
+        # Numbers that do not fit a format's types are found in what it gives; numpy need not warn.
+        with _silent_trimesh(), np.errstate(all="ignore"):
             scene = trimesh.load_scene(source, file_type=file_type, resolver=files, process=False)
     except Exception as error:  # parsers raise whatever the broken bytes lead them to
         raise MeshError(

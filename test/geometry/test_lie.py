@@ -123,3 +123,8 @@ def _broken(change):
 )
 def test_what_is_not_rigid(T):
     assert not lie.is_rigid(T)
+
+
+@pytest.mark.filterwarnings("error")
+def test_entries_whose_squares_overflow_are_no_rotation():
+    assert not lie.is_rigid(np.diag([1e308, -1e308, 1e200, 1.0]))

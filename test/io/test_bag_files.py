@@ -185,3 +185,10 @@ def test_flipped_bits_never_alter_what_is_read(tmp_path):
         except BagError as error:
             refused += "\n" not in str(error)
     assert refused > 40
+
+
+def test_metadata_whose_numbers_are_none_is_damaged(bag):
+    (bag / MANIFEST).unlink()
+    (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: {version: !!int '', relative_file_paths: []}")
+    with pytest.raises(BagError, match="is damaged: delete it"):
+        BagReader(bag)

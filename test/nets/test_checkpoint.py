@@ -244,3 +244,12 @@ def test_every_single_file_has_a_published_checksum_and_a_network():
         assert entry.library_folder or len(entry.sha256) == 64, name
         assert entry.library_folder or not check(name, "/nonexistent").usable
     assert set(_NETWORKS) == {name for name, entry in CHECKPOINTS.items() if not entry.library_folder}
+
+
+def test_a_pickle_that_numbers_its_objects_absurdly_is_refused_before_it_is_read(folder, toy):
+    for number in (2**31, 10**8):  # 32 and 1.6 GiB in the C reader
+        path = folder / "toy.pth"
+        path.write_bytes(b"\x80\x02K\x01r" + number.to_bytes(4, "little") + b".")
+        toy(path)
+        with pytest.raises(WeightsError, match=f"object number {number} is too large"):
+            convert("toy")

@@ -29,6 +29,8 @@ from hat_ros.errors import DatasetError
 from hat_ros.types import MASK_BOX, MASK_SILHOUETTE, MAX_IMAGE_SIDE_PX
 
 MAX_FILE_BYTES = 1 << 30
+# Of scores and of pixels; JSON holds integers that no float can.
+_LARGEST = 1e9
 MASK_SUFFIXES = (".png", ".bmp", ".tif", ".tiff", ".jpg", ".jpeg")
 
 Mask = UInt8
@@ -164,7 +166,7 @@ def _checked(item: Any, where: str) -> tuple[str, float]:
     image_id, score = item["image_id"], item.get("score", 1.0)
     if isinstance(image_id, bool) or not isinstance(image_id, (int, str)):
         raise DatasetError(f"{where}: image_id must be a number or a file name, found {image_id!r}")
-    if isinstance(score, bool) or not isinstance(score, (int, float)) or not math.isfinite(score):
+    if isinstance(score, bool) or not isinstance(score, (int, float)) or not abs(score) <= _LARGEST:
         raise DatasetError(f"{where}: score must be a finite number, found {score!r}")
     if item.get("segmentation") is None and item.get("bbox") is None:
         raise DatasetError(f"{where}: it has neither 'segmentation' nor 'bbox'")
@@ -184,8 +186,8 @@ def _from_box_mapping(data: dict[str, Any], path: Path) -> DetectionLookup:
 
 def _four_numbers(value: Any, where: str) -> tuple[float, float, float, float]:
     ok = isinstance(value, list) and len(value) == 4
-    if not ok or not all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in value):
-        raise DatasetError(f"{where}: a box must be four finite numbers, found {value!r}")
+    if not ok or not all(isinstance(v, (int, float)) and not isinstance(v, bool) and abs(v) <= _LARGEST for v in value):
+        raise DatasetError(f"{where}: a box must be four finite numbers of at most {_LARGEST:g} px, found {value!r}")
     a, b, c, d = value
     return float(a), float(b), float(c), float(d)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -177,12 +178,12 @@ def pose_from_label(quat: object, translation_m: object, order: str, where: str)
     """
     try:
         q, t = np.array(quat, dtype=np.float64), np.array(translation_m, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise DatasetError(f"{where}: pose label is not made of numbers: {quat}, {translation_m}") from None
     if q.shape != (4,) or t.shape != (3,) or not (np.isfinite(q).all() and np.isfinite(t).all()):
         raise DatasetError(f"{where}: pose label needs 4 + 3 finite numbers, found {q.tolist()} and {t.tolist()}")
-    if abs(np.linalg.norm(q) - 1.0) > 0.01:
-        raise DatasetError(f"{where}: quaternion has length {np.linalg.norm(q):.4f}, expected 1")
+    if abs(math.hypot(*q) - 1.0) > 0.01:
+        raise DatasetError(f"{where}: quaternion has length {math.hypot(*q):.4f}, expected 1")
     return lie.transform(lie.matrix_from_quat(q[[1, 2, 3, 0]] if order == "wxyz" else q), t)
 
 

@@ -13,6 +13,7 @@ Poses map target (the CAD file's own axes) to camera (OpenCV), as everywhere her
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -96,8 +97,8 @@ def _read_tum(path: Path, text: str) -> ExternalPoses:
         except (InvalidOperation, ValueError, OverflowError):
             raise InputError(f"{where}: '{words[0]}' is no time in seconds") from None
         row = _numbers(words[1:], where)
-        if abs(np.linalg.norm(row[3:]) - 1.0) > 0.01:
-            raise InputError(f"{where}: the quaternion has length {np.linalg.norm(row[3:]):.4f}, expected 1")
+        if abs(math.hypot(*row[3:]) - 1.0) > 0.01:
+            raise InputError(f"{where}: the quaternion has length {math.hypot(*row[3:]):.4f}, expected 1")
         row[3:] /= np.linalg.norm(row[3:])
         rows[stamp_ns] = row
     return ExternalPoses(rows, np.zeros(0))

@@ -27,6 +27,9 @@ from hat_ros.target.loading import find_model
 from hat_ros.target.units import AUTO
 from hat_ros.types import Camera
 
+# What file systems take.
+_MAX_NAME_BYTES = 255
+
 
 def load_sequence(folder: str | Path) -> ImageRecording:
     """Open a clip of the ``sequence`` layout; images are decoded as they are asked for.
@@ -95,8 +98,10 @@ def named_in(folder: Path, name: str, where: str) -> Path:
     """The file of a folder that a label names; it is copied into bags, so it must not lead out of the folder.
 
     Raises:
-        DatasetError: an absolute path, or one with ``..``.
+        DatasetError: an absolute path, one with ``..``, or one that is too long for any file.
     """
+    if max((len(part.encode("utf-8", "replace")) for part in Path(name).parts), default=0) > _MAX_NAME_BYTES:
+        raise DatasetError(f"{where}: {name[:80]!r}... is too long for the name of a file")
     if Path(name).is_absolute() or ".." in Path(name).parts or "\0" in name:
         raise DatasetError(f"{where}: {name[:80]!r} leads out of {folder}: name a file in that folder")
     return folder / name
