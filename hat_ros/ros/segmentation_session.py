@@ -63,6 +63,10 @@ class SegmentationSession(Session):
         subscribe(topics.READY, self._on_ready, profile=qos.LATCH_READER, required=False)
 
     def every_second(self) -> None:
+        """Look again for a second camera."""
+        self._expect_one_camera()
+
+    def _expect_one_camera(self) -> None:
         """Notice a second camera on the same topic: the frames of both would be one sequence.
 
         Raises:
@@ -135,6 +139,8 @@ class SegmentationSession(Session):
     def _pump(self) -> None:
         if not self._is_open:
             self._is_open = self._ready_nodes >= _STAGES and not self._node.endpoints.unmatched()
+            if self._is_open:  # before the first frame: a short recording is over within a second
+                self._expect_one_camera()
         while self._is_open and self._in_flight.admission.has_credit:
             try:
                 found = self._entrance.next_frame(self._in_flight.admission)

@@ -95,7 +95,8 @@ def target_from_scene(scene: trimesh.Scene, name: str, unit_scale: float = 1.0) 
     """
     if not (np.isfinite(unit_scale) and unit_scale > 0):
         raise MeshError(f"CAD model {name}: unit_scale must be a positive number, found {unit_scale}")
-    found = (_part(scene, node, name) for node in _ordered_nodes(scene))
+    with np.errstate(over="ignore", invalid="ignore"):  # coordinates that overflow are refused below by their extent
+        found = [_part(scene, node, name) for node in _ordered_nodes(scene)]
     parts = [part for part in found if part is not None]
     if not parts:
         raise MeshError(f"CAD model {name}: it holds no triangles; export the surface as a triangle mesh")

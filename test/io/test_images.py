@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import array
+
 import cv2
 import numpy as np
 import pytest
@@ -122,7 +124,7 @@ def test_yuv_of_either_range_gives_the_colours_back(encoding, full):
     yuv = np.rint(yuv_of(blocks(), full)).clip(0, 255).astype(np.uint8)
     if encoding.startswith("nv"):
         m = message(encoding, yuv[..., 0])
-        m.data = planar_yuv(encoding, yuv)
+        m.data = array.array("B", planar_yuv(encoding, yuv).tobytes())
     else:
         m = message(encoding, packed_yuv(encoding, yuv))
     found, known = images.decode_image(m)
