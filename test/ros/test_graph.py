@@ -227,6 +227,7 @@ def test_live_goes_on_in_a_new_epoch_after_a_stage_hung(clean_bag, config, tmp_p
 
 def test_a_second_camera_on_the_same_topic_is_named(clean_bag, config, tmp_path):
     context = rclpy.Context()
+    slow = {"segmentation": 400.0}  # longer than a second in all: participants need time to find each other
     with reserved_domain(None) as domain:
         rclpy.init(context=context, domain_id=domain)
         other = rclpy.create_node("other_camera", context=context)
@@ -234,7 +235,15 @@ def test_a_second_camera_on_the_same_topic_is_named(clean_bag, config, tmp_path)
         other.create_publisher(kind, topics.IMAGE, 1)
         try:
             with pytest.raises(RunError, match=r"/image has 2 publishers \(/hat/player, /other_camera\): stop"):
-                replay(clean_bag, config, clean_bag / "target.yaml", tmp_path / "out", graph="single", domain_id=domain)
+                replay(
+                    clean_bag,
+                    config,
+                    clean_bag / "target.yaml",
+                    tmp_path / "out",
+                    graph="single",
+                    domain_id=domain,
+                    stage_delays_ms=slow,
+                )
         finally:
             other.destroy_node()
             context.try_shutdown()
