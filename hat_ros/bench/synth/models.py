@@ -11,16 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from PIL import Image, ImageDraw
 from trimesh.visual.material import PBRMaterial
-from trimesh.visual.texture import TextureVisuals
 
-from hat_ros.array_types import Float
+from hat_ros.bench.synth.parts import TILE_M, add, box, foil, moved, plain, solar_cells, turned
 from hat_ros.errors import UsageError
 from hat_ros.target.loading import target_from_scene
 from hat_ros.target.model import Target
-
-_TILE_M = 0.5
 
 
 def model_names() -> list[str]:
@@ -60,29 +56,29 @@ def _observer(asymmetry: float) -> trimesh.Scene:
     """A foil-wrapped observation satellite, 2.6 m over two wings; nearly itself after half a turn about z."""
     m = _materials()
     scene = trimesh.Scene()
-    _add(scene, "bus", _box((0.8, 0.7, 1.0)), m["foil"])
-    _add(scene, "deck_top", _box((0.84, 0.74, 0.05), (0, 0, 0.52)), m["white"])
-    _add(scene, "deck_bottom", _box((0.84, 0.74, 0.05), (0, 0, -0.52)), m["grey"])
+    add(scene, "bus", box((0.8, 0.7, 1.0)), m["foil"])
+    add(scene, "deck_top", box((0.84, 0.74, 0.05), (0, 0, 0.52)), m["white"])
+    add(scene, "deck_bottom", box((0.84, 0.74, 0.05), (0, 0, -0.52)), m["grey"])
     for side in (1, -1):
         for axis in (0.41, -0.41):  # radiators and equipment boxes on both x faces, alike under the half turn
-            _add(scene, f"radiator{side}{axis}", _box((0.02, 0.5, 0.35), (axis * 1.0, 0.05 * side, 0.2)), m["white"])
-        _add(scene, f"box{side}", _box((0.12, 0.22, 0.2), (0.45 * side, -0.18 * side, -0.25)), m["grey"])
-        _add(scene, f"yoke{side}", _box((0.03, 0.2, 0.03), (0, side * 0.44, 0)), m["dark"])
+            add(scene, f"radiator{side}{axis}", box((0.02, 0.5, 0.35), (axis * 1.0, 0.05 * side, 0.2)), m["white"])
+        add(scene, f"box{side}", box((0.12, 0.22, 0.2), (0.45 * side, -0.18 * side, -0.25)), m["grey"])
+        add(scene, f"yoke{side}", box((0.03, 0.2, 0.03), (0, side * 0.44, 0)), m["dark"])
         for panel in range(2):
             y = side * (0.54 + 0.19 + panel * 0.40)
-            _add(scene, f"wing{side}_{panel}", _box((0.02, 0.38, 0.9), (0, y, 0)), m["cells"])
-    _add(scene, "telescope", _turned([(0.0, 0.0), (0.24, 0.0), (0.24, 0.34), (0.21, 0.34), (0.21, 0.06), (0.0, 0.06)],
+            add(scene, f"wing{side}_{panel}", box((0.02, 0.38, 0.9), (0, y, 0)), m["cells"])
+    add(scene, "telescope", turned([(0.0, 0.0), (0.24, 0.0), (0.24, 0.34), (0.21, 0.34), (0.21, 0.06), (0.0, 0.06)],
                                      (0, 0, 0.545)), m["dark"])  # fmt: skip
-    _add(scene, "nozzle", _turned([(0.05, 0.0), (0.16, -0.18)], (0, 0, -0.545)), m["dark"])
+    add(scene, "nozzle", turned([(0.05, 0.0), (0.16, -0.18)], (0, 0, -0.545)), m["dark"])
     # What breaks the half-turn symmetry.
     if asymmetry > 0:
-        dish = _turned([(0.0, 0.0), (0.12, 0.02), (0.22, 0.08), (0.3, 0.17)], (0, 0, 0))
+        dish = turned([(0.0, 0.0), (0.12, 0.02), (0.22, 0.08), (0.3, 0.17)], (0, 0, 0))
         dish.apply_transform(trimesh.transformations.rotation_matrix(np.radians(80), (0, 1, 0)))
         dish.apply_scale(asymmetry)
-        _add(scene, "dish", _moved(dish, (0.43, 0.0, -0.02)), m["white"])
-        boom = _box((0.9 * asymmetry, 0.03, 0.03), (-0.4 - 0.45 * asymmetry, 0.2, 0.35))
-        _add(scene, "boom", boom, m["grey"])
-        _add(scene, "boom_head", _box((0.1 * asymmetry,) * 3, (-0.4 - 0.9 * asymmetry, 0.2, 0.35)), m["red"])
+        add(scene, "dish", moved(dish, (0.43, 0.0, -0.02)), m["white"])
+        boom = box((0.9 * asymmetry, 0.03, 0.03), (-0.4 - 0.45 * asymmetry, 0.2, 0.35))
+        add(scene, "boom", boom, m["grey"])
+        add(scene, "boom_head", box((0.1 * asymmetry,) * 3, (-0.4 - 0.9 * asymmetry, 0.2, 0.35)), m["red"])
     return scene
 
 
@@ -90,16 +86,16 @@ def _cubesat(asymmetry: float) -> trimesh.Scene:
     """A 3U CubeSat, 0.34 m long, with four deployed panels and a patch antenna."""
     m = _materials(0.1)
     scene = trimesh.Scene()
-    _add(scene, "body", _box((0.1, 0.1, 0.34)), m["cells"], 0.1)
+    add(scene, "body", box((0.1, 0.1, 0.34)), m["cells"], 0.1)
     for rail, (x, y) in enumerate([(1, 1), (1, -1), (-1, 1), (-1, -1)]):
-        _add(scene, f"rail{rail}", _box((0.012, 0.012, 0.35), (0.046 * x, 0.046 * y, 0)), m["grey"])
+        add(scene, f"rail{rail}", box((0.012, 0.012, 0.35), (0.046 * x, 0.046 * y, 0)), m["grey"])
     for side in (1, -1):
-        _add(scene, f"wing_y{side}", _box((0.09, 0.3, 0.003), (0, side * 0.2, 0.17)), m["cells"], 0.1)
-        _add(scene, f"wing_x{side}", _box((0.2, 0.09, 0.003), (side * 0.15, 0, 0.17)), m["cells"], 0.1)
-    _add(scene, "lens", _turned([(0.0, 0.0), (0.035, 0.0), (0.03, -0.02), (0.0, -0.02)], (0, 0, -0.172)), m["dark"])
+        add(scene, f"wing_y{side}", box((0.09, 0.3, 0.003), (0, side * 0.2, 0.17)), m["cells"], 0.1)
+        add(scene, f"wing_x{side}", box((0.2, 0.09, 0.003), (side * 0.15, 0, 0.17)), m["cells"], 0.1)
+    add(scene, "lens", turned([(0.0, 0.0), (0.035, 0.0), (0.03, -0.02), (0.0, -0.02)], (0, 0, -0.172)), m["dark"])
     if asymmetry > 0:
-        _add(scene, "patch", _box((0.006, 0.07 * asymmetry, 0.07 * asymmetry), (0.053, 0, -0.08)), m["white"])
-        _add(scene, "antenna", _box((0.003, 0.003, 0.17 * asymmetry), (-0.045, 0.03, -0.17 - 0.085 * asymmetry)),
+        add(scene, "patch", box((0.006, 0.07 * asymmetry, 0.07 * asymmetry), (0.053, 0, -0.08)), m["white"])
+        add(scene, "antenna", box((0.003, 0.003, 0.17 * asymmetry), (-0.045, 0.03, -0.17 - 0.085 * asymmetry)),
              m["red"])  # fmt: skip
     return scene
 
@@ -110,15 +106,15 @@ def _freighter(asymmetry: float) -> trimesh.Scene:
     scene = trimesh.Scene()
     outline = [(0.0, 1.6), (0.5, 1.6), (0.55, 1.45), (0.8, 1.25), (0.8, -0.6), (0.7, -0.75), (0.7, -1.2), (0.25, -1.2),
                (0.38, -1.6)]  # fmt: skip
-    _add(scene, "hull", _turned(outline, (0, 0, 0)), m["white"])
-    _add(scene, "band", _turned([(0.81, 0.1), (0.815, 0.1), (0.815, -0.5), (0.81, -0.5)], (0, 0, 0)), m["foil"])
+    add(scene, "hull", turned(outline, (0, 0, 0)), m["white"])
+    add(scene, "band", turned([(0.81, 0.1), (0.815, 0.1), (0.815, -0.5), (0.81, -0.5)], (0, 0, 0)), m["foil"])
     for side in (1, -1):
-        _add(scene, f"yoke{side}", _box((0.05, 0.3, 0.05), (0, side * 0.85, -0.95)), m["grey"])
-        _add(scene, f"wing{side}", _box((0.03, 1.4, 0.7), (0, side * 1.7, -0.95)), m["cells"])
-        _add(scene, f"thruster{side}", _box((0.15, 0.15, 0.3), (side * 0.8, 0, 1.0)), m["dark"])
+        add(scene, f"yoke{side}", box((0.05, 0.3, 0.05), (0, side * 0.85, -0.95)), m["grey"])
+        add(scene, f"wing{side}", box((0.03, 1.4, 0.7), (0, side * 1.7, -0.95)), m["cells"])
+        add(scene, f"thruster{side}", box((0.15, 0.15, 0.3), (side * 0.8, 0, 1.0)), m["dark"])
     if asymmetry > 0:
-        _add(scene, "grapple", _box((0.18 * asymmetry, 0.3 * asymmetry, 0.3 * asymmetry), (0.82, 0.0, 0.45)), m["red"])
-        _add(scene, "sensor", _box((0.12 * asymmetry, 0.12, 0.5), (-0.82, 0.25, 0.3)), m["dark"])
+        add(scene, "grapple", box((0.18 * asymmetry, 0.3 * asymmetry, 0.3 * asymmetry), (0.82, 0.0, 0.45)), m["red"])
+        add(scene, "sensor", box((0.12 * asymmetry, 0.12, 0.5), (-0.82, 0.25, 0.3)), m["dark"])
     return scene
 
 
@@ -126,21 +122,21 @@ def _probe(asymmetry: float) -> trimesh.Scene:
     """A science probe without wings: a box with a large dish and three booms of different length."""
     m = _materials()
     scene = trimesh.Scene()
-    _add(scene, "bus", _box((0.9, 0.9, 0.6)), m["foil"])
-    _add(scene, "panel", _box((0.92, 0.6, 0.3), (0, 0, 0.02)), m["cells"])
-    _add(scene, "dish", _turned([(0.0, 0.0), (0.3, 0.04), (0.55, 0.14), (0.75, 0.28)], (0, 0, 0.32)), m["white"])
-    _add(scene, "feed", _turned([(0.0, 0.5), (0.06, 0.5), (0.06, 0.42), (0.0, 0.42)], (0, 0, 0.32)), m["dark"])
+    add(scene, "bus", box((0.9, 0.9, 0.6)), m["foil"])
+    add(scene, "panel", box((0.92, 0.6, 0.3), (0, 0, 0.02)), m["cells"])
+    add(scene, "dish", turned([(0.0, 0.0), (0.3, 0.04), (0.55, 0.14), (0.75, 0.28)], (0, 0, 0.32)), m["white"])
+    add(scene, "feed", turned([(0.0, 0.5), (0.06, 0.5), (0.06, 0.42), (0.0, 0.42)], (0, 0, 0.32)), m["dark"])
     for leg, angle in enumerate(np.radians([90, 210, 330])):
         strut = trimesh.creation.cylinder(
             0.012, segment=[(0.5 * np.cos(angle), 0.5 * np.sin(angle), 0.44), (0, 0, 0.8)], sections=8
         )
-        _add(scene, f"strut{leg}", strut, m["grey"])
+        add(scene, f"strut{leg}", strut, m["grey"])
     for boom, (direction, length) in enumerate([((1, 0), 1.4), ((-0.5, 0.8), 0.9), ((-0.5, -0.8), 0.6)]):
         length = 0.9 + asymmetry * (length - 0.9)
         end = np.array([*direction, -0.2]) / np.linalg.norm([*direction, -0.2])
         start, tip = 0.45 * end, (0.45 + length) * end
-        _add(scene, f"boom{boom}", trimesh.creation.cylinder(0.02, segment=[start, tip], sections=10), m["grey"])
-        _add(scene, f"head{boom}", _moved(trimesh.creation.icosphere(2, 0.07), tip), m["dark" if boom else "red"])
+        add(scene, f"boom{boom}", trimesh.creation.cylinder(0.02, segment=[start, tip], sections=10), m["grey"])
+        add(scene, f"head{boom}", moved(trimesh.creation.icosphere(2, 0.07), tip), m["dark" if boom else "red"])
     return scene
 
 
@@ -152,67 +148,14 @@ _BUILDERS: dict[str, Callable[[float], trimesh.Scene]] = {
 }
 
 
-def _materials(tile_m: float = _TILE_M) -> dict[str, PBRMaterial]:
+def _materials(tile_m: float = TILE_M) -> dict[str, PBRMaterial]:
     rng = np.random.default_rng(7)
-    cells, foil = _cells(rng), _foil(rng)
+    cells, wrinkled = solar_cells(rng), foil(rng)
     return {
         "cells": PBRMaterial(name="cells", baseColorTexture=cells, roughnessFactor=0.35, metallicFactor=0.0),
-        "foil": PBRMaterial(name="foil", baseColorTexture=foil, roughnessFactor=0.3, metallicFactor=0.4),
-        "white": _plain("white", (225, 225, 220), 0.6),
-        "grey": _plain("grey", (120, 122, 125), 0.5),
-        "dark": _plain("dark", (38, 38, 42), 0.5),
-        "red": _plain("red", (170, 45, 35), 0.6),
+        "foil": PBRMaterial(name="foil", baseColorTexture=wrinkled, roughnessFactor=0.3, metallicFactor=0.4),
+        "white": plain("white", (225, 225, 220), 0.6),
+        "grey": plain("grey", (120, 122, 125), 0.5),
+        "dark": plain("dark", (38, 38, 42), 0.5),
+        "red": plain("red", (170, 45, 35), 0.6),
     }
-
-
-def _plain(name: str, srgb: tuple[int, int, int], roughness: float) -> PBRMaterial:
-    texture = Image.new("RGB", (4, 4), srgb)
-    return PBRMaterial(name=name, baseColorTexture=texture, roughnessFactor=roughness, metallicFactor=0.0)
-
-
-def _cells(rng: np.random.Generator) -> Image.Image:
-    """Solar cells: 4 x 8 of them, each of its own blue, with silver grid lines."""
-    image = Image.new("RGB", (128, 128), (150, 155, 165))
-    draw = ImageDraw.Draw(image)
-    for row in range(4):
-        for col in range(8):
-            blue = np.array([18, 26, 70]) + rng.integers(-6, 14, 3)
-            draw.rectangle((col * 16 + 1, row * 32 + 1, col * 16 + 14, row * 32 + 30), fill=tuple(blue.tolist()))
-    return image
-
-
-def _foil(rng: np.random.Generator) -> Image.Image:
-    """Crinkled gold foil: patches of light and dark."""
-    coarse = Image.fromarray(rng.integers(0, 256, (12, 12), dtype=np.uint8)).resize(
-        (128, 128), Image.Resampling.BICUBIC
-    )
-    fine = Image.fromarray(rng.integers(0, 256, (32, 32), dtype=np.uint8)).resize((128, 128), Image.Resampling.BICUBIC)
-    shade = 0.55 + 0.45 * (0.6 * np.asarray(coarse) + 0.4 * np.asarray(fine))[..., None] / 255.0
-    return Image.fromarray(np.clip(shade * np.array([222, 168, 72]), 0, 255).astype(np.uint8))
-
-
-def _add(
-    scene: trimesh.Scene, name: str, mesh: trimesh.Trimesh, material: PBRMaterial, tile_m: float = _TILE_M
-) -> None:
-    """Give every face flat texture coordinates (box mapping, one tile per ``tile_m``) and add it under a name."""
-    corners = np.asarray(mesh.triangles)
-    normals = np.abs(np.asarray(mesh.face_normals))
-    axes = np.array([[1, 2], [0, 2], [0, 1]])[np.argmax(normals, axis=1)]
-    uv = np.take_along_axis(corners, np.repeat(axes[:, None], 3, axis=1), axis=2) / tile_m
-    flat = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
-    flat.visual = TextureVisuals(uv=uv.reshape(-1, 2), material=material)
-    scene.add_geometry(flat, node_name=name, geom_name=name)
-
-
-def _box(size: tuple[float, ...], center: tuple[float, ...] = (0, 0, 0)) -> trimesh.Trimesh:
-    return _moved(trimesh.creation.box(size), center)
-
-
-def _turned(outline: list[tuple[float, float]], base: tuple[float, ...]) -> trimesh.Trimesh:
-    """Body of revolution about z from (radius, height) points."""
-    return _moved(trimesh.creation.revolve(np.array(outline), sections=40), base)
-
-
-def _moved(mesh: trimesh.Trimesh, offset: tuple[float, ...] | Float) -> trimesh.Trimesh:
-    mesh.apply_translation(offset)
-    return mesh
