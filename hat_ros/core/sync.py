@@ -11,6 +11,13 @@ from typing import Any
 
 from hat_ros.errors import FrameError, RunError
 
+# A clock that stepped back sends frames that are old and in order among themselves. A duplicate or a late frame stands
+# alone, and of a driver that sends a few frames again not so many come in a row.
+RESTART_FRAMES = 5
+# Old items of one stream that are kept until it is known whether the stamps begin anew: as many as a queue holds.
+_EARLY_ITEMS = 16
+_NEVER_NS = -(2**63)
+
 
 class ExactJoin:
     """Joins one item of each named stream by exact stamp, and hands the joined sets out in stamp order.
@@ -22,7 +29,8 @@ class ExactJoin:
     def __init__(self, names: Sequence[str]) -> None:
         self._names = tuple(names)
         self._pending: dict[int, dict[str, Any]] = {}
-        self._passed_ns = -(2**63)
+        self._old: dict[str, dict[int, Any]] = {name: {} for name in names}
+        self._passed_ns = _NEVER_NS
         self.late = 0
 
     def __len__(self) -> int:
@@ -30,11 +38,32 @@ class ExactJoin:
         return len(self._pending)
 
     def put(self, name: str, stamp_ns: int, item: Any) -> None:
-        """Add an item; one for a stamp that has been passed already is dropped and counted in :attr:`late`."""
-        if stamp_ns <= self._passed_ns:
-            self.late += 1
+        """Add an item; one for a stamp that has been passed already is no part of a set and counted in :attr:`late`.
+
+        It is kept, though, until the next set is taken: it may have come before the word that stamps begin anew.
+        """
+        if stamp_ns > self._passed_ns:
+            self._pending.setdefault(stamp_ns, {})[name] = item
             return
-        self._pending.setdefault(stamp_ns, {})[name] = item
+        self.late += 1
+        old = self._old[name]
+        old.pop(stamp_ns, None)
+        old[stamp_ns] = item
+        if len(old) > _EARLY_ITEMS:
+            del old[next(iter(old))]
+
+    def restart(self, decider: str, stamp_ns: int) -> None:
+        """Stamps begin anew at this one, as the stream ``decider`` says: its sets so far are given up.
+
+        Items of the other streams that came before that word are kept, as far as the stamps may be new ones.
+        """
+        begun = {stamp: items for stamp, items in self._pending.items() if decider not in items and stamp >= stamp_ns}
+        for name, old in self._old.items():
+            for stamp in [stamp for stamp in old if stamp >= stamp_ns]:
+                begun.setdefault(stamp, {})[name] = old[stamp]
+                self.late -= 1
+            old.clear()
+        self._pending, self._passed_ns = begun, stamp_ns - 1
 
     def peek(self) -> tuple[int, dict[str, Any]] | None:
         """Stamp and items of the earliest complete set, None when there is none; it stays."""
@@ -57,6 +86,8 @@ class ExactJoin:
             raise RunError(f"a message was lost: frame {missing[0]} never had {', '.join(missing[1])}")
         del self._pending[stamp_ns]
         self._passed_ns = stamp_ns
+        for old in self._old.values():
+            old.clear()
         return stamp_ns, items
 
     def drop_before(self, stamp_ns: int) -> None:
@@ -79,11 +110,14 @@ class Admission:
 
     Args:
         credits: W, frames that may be in flight; each status returns one.
+        restarts: stamps may begin anew: after :data:`RESTART_FRAMES` - 1 frames in a row that were refused as old, and
+            were in order among themselves, the next one of them enters. Otherwise old frames are refused for ever.
     """
 
-    def __init__(self, credits: int) -> None:
-        self._credits = credits
+    def __init__(self, credits: int, restarts: bool = False) -> None:
+        self._credits, self._restarts = credits, restarts
         self._in_flight: dict[int, None] = {}
+        self._n_old, self._newest_old_ns = 0, 0
         self.last_stamp_ns = 0
         self.seq = -1
 
@@ -97,19 +131,27 @@ class Admission:
         """Whether another frame may enter now."""
         return len(self._in_flight) < self._credits
 
+    def begins_anew(self, stamp_ns: int) -> bool:
+        """Whether this stamp may enter although it is not later than the last one: the clock has stepped back."""
+        in_order = self._n_old >= RESTART_FRAMES - 1 and stamp_ns > self._newest_old_ns
+        return self._restarts and in_order and stamp_ns <= self.last_stamp_ns
+
     def check(self, stamp_ns: int) -> None:
-        """Refuse a stamp that may not enter.
+        """Refuse a stamp that may not enter; the caller drops its frame.
 
         Raises:
             FrameError: the stamp is zero, negative, or not later than that of the last admitted frame.
         """
         if stamp_ns <= 0:
             raise FrameError(f"header.stamp must be positive, found {stamp_ns} ns: stamp images with the exposure time")
-        if stamp_ns <= self.last_stamp_ns:
-            raise FrameError(
-                f"header.stamp must increase, found {stamp_ns} ns after {self.last_stamp_ns} ns: "
-                f"the frame is a duplicate or out of order"
-            )
+        if stamp_ns > self.last_stamp_ns or self.begins_anew(stamp_ns):
+            return
+        self._n_old = self._n_old + 1 if stamp_ns > self._newest_old_ns else 1
+        self._newest_old_ns = stamp_ns
+        raise FrameError(
+            f"header.stamp must increase, found {stamp_ns} ns after {self.last_stamp_ns} ns: "
+            f"the frame is a duplicate or out of order"
+        )
 
     def admit(self, stamp_ns: int) -> int:
         """Let a frame in and number it from 0; it takes one credit.
@@ -119,6 +161,7 @@ class Admission:
         """
         self.check(stamp_ns)
         self.last_stamp_ns = stamp_ns
+        self._n_old, self._newest_old_ns = 0, 0
         self.seq += 1
         self._in_flight[stamp_ns] = None
         return self.seq

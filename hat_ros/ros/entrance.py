@@ -72,10 +72,12 @@ class Entrance:
         self._count_gaps = False
 
     def add_mask(self, message: Any) -> None:
-        """Keep a mask for its image."""
-        self._masks[messages.stamp_of(message)] = message
-        while len(self._masks) > _MASKS_KEPT:
-            del self._masks[min(self._masks)]
+        """Keep a mask for its image; of many the one that came first goes, since stamps may begin anew."""
+        stamp_ns = messages.stamp_of(message)
+        self._masks.pop(stamp_ns, None)
+        self._masks[stamp_ns] = message
+        if len(self._masks) > _MASKS_KEPT:
+            del self._masks[next(iter(self._masks))]
 
     def set_calibration(self, calibration: Calibration) -> bool:
         """Take over a calibration; whether it replaces a different one. One that agrees changes nothing.

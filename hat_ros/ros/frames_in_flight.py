@@ -16,16 +16,17 @@ class FramesInFlight:
     Args:
         config: its time limits and, in a replay, the credits W.
         live: one frame in flight.
+        restarts: stamps that step back begin anew, see :class:`~hat_ros.core.sync.Admission`.
 
     Attributes:
         admission: stamps and credits.
     """
 
-    def __init__(self, config: GraphConfig, live: bool) -> None:
+    def __init__(self, config: GraphConfig, live: bool, restarts: bool = False) -> None:
         self._config = config
         self._entered_s: dict[int, float] = {}
         self._is_warm = False
-        self.admission = Admission(1 if live else config.credits_replay)
+        self.admission = Admission(1 if live else config.credits_replay, restarts)
 
     @property
     def admitted(self) -> int:

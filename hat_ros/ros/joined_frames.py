@@ -67,7 +67,9 @@ class JoinedFrames:
         self._reset = reset
         self._with_image = topics.FRAME in joined
         self._cameras: list[tuple[int, Camera]] = []
-        self._epoch: int | None = None
+        self._epoch: int | None = None  # of the last frame taken; None: the next one opens an epoch
+        self._is_fresh = True
+        self._newest_ns = 0
 
     def __len__(self) -> int:
         """Frames of which something is waiting."""
@@ -83,12 +85,24 @@ class JoinedFrames:
         return self._join.missing()
 
     def put(self, topic: str, message: Any) -> None:
-        """Add a message of a joined topic."""
-        self._join.put(topic, messages.stamp_of(message), message)
+        """Add a message of a joined topic.
+
+        Admissions come in the order of entry and once for each frame. So one whose stamp is not later than the last
+        tells that the stamps begin anew, which the entrance allows only in a new epoch, with no frame under way.
+        """
+        stamp_ns = messages.stamp_of(message)
+        if topic == topics.ADMISSION:
+            if stamp_ns <= self._newest_ns:
+                self._join.restart(topic, stamp_ns)
+                self._epoch = None
+            self._newest_ns = stamp_ns
+        self._join.put(topic, stamp_ns, message)
 
     def put_camera(self, message: Any) -> None:
-        """Add a calibration, in force from its stamp on."""
-        self._cameras.append((messages.stamp_of(message), messages.camera_from(message)))
+        """Add a calibration, in force from its stamp on; later stamps than its own are those of an old epoch."""
+        stamp_ns = messages.stamp_of(message)
+        self._cameras = [item for item in self._cameras if item[0] < stamp_ns]
+        self._cameras.append((stamp_ns, messages.camera_from(message)))
 
     def put_status(self, message: Any) -> None:
         """Add a fused pose of the past."""
@@ -122,11 +136,11 @@ class JoinedFrames:
         return JoinedFrame(stamp_ns, admitted, items, camera, prior)
 
     def _enter(self, epoch: int) -> None:
-        if self._epoch is not None:
+        if not self._is_fresh:
             self._reset()
             if self._priors is not None:
                 self._priors.reset()
-        self._epoch = epoch
+        self._epoch, self._is_fresh = epoch, False
 
     def _camera_at(self, stamp_ns: int) -> Camera | None:
         """The newest calibration that is not newer than the stamp."""

@@ -48,9 +48,11 @@ class OverlaySession(Session):
         self._camera = messages.camera_from(message)
 
     def _on_frame(self, message: Any) -> None:
-        self._frames[messages.stamp_of(message)] = message
-        while len(self._frames) > _FRAMES_KEPT:
-            del self._frames[min(self._frames)]
+        stamp_ns = messages.stamp_of(message)
+        self._frames.pop(stamp_ns, None)
+        self._frames[stamp_ns] = message
+        if len(self._frames) > _FRAMES_KEPT:
+            del self._frames[next(iter(self._frames))]  # the one that came first: stamps may begin anew
 
     def _on_status(self, message: Any) -> None:
         estimate = messages.status_from(message).estimate

@@ -9,6 +9,7 @@ from typing import Any
 from rclpy.duration import Duration
 from std_srvs.srv import Trigger
 
+from hat_ros.core.sync import RESTART_FRAMES
 from hat_ros.errors import FrameError, RunError
 from hat_ros.io import messages, topics
 from hat_ros.io.calibration import calibration_from
@@ -38,7 +39,8 @@ class SegmentationSession(Session):
         self._entrance = Entrance(live, annotated, config.camera.image_depth)
         self._rectified = config.camera.rectified
         self._image_topic = node.resolve_topic_name(topics.IMAGE)
-        self._in_flight = FramesInFlight(config.graph, live)
+        # A record tells frames by their stamps: there none may come twice.
+        self._in_flight = FramesInFlight(config.graph, live, restarts=live and not node.settings.recorded)
         self._epoch = 0
         self._camera_sent = self._is_open = False
         self._ready_nodes: set[str] = set()
@@ -153,6 +155,8 @@ class SegmentationSession(Session):
 
     def _admit(self, frame: Frame, frame_id: str) -> None:
         stamp_ns = frame.stamp_ns
+        if self._in_flight.admission.begins_anew(stamp_ns):
+            self._begin_anew(stamp_ns)
         if not self._camera_sent:
             self._camera_sent = True
             self._camera_info.publish(self._wire.camera_info(stamp_ns, frame_id, frame.camera))
@@ -164,6 +168,17 @@ class SegmentationSession(Session):
         with self._step_timer.frame():
             detection = self._stage.update(frame, self._priors.before(stamp_ns))
             self._frame.publish(self._wire.frame(stamp_ns, frame_id, frame.rgb, detection))
+
+    def _begin_anew(self, stamp_ns: int) -> None:
+        """The camera's clock has stepped back: a new epoch, and the calibration in force from this stamp on."""
+        sentence = (
+            f"header.stamp steps back from {self._in_flight.admission.last_stamp_ns} ns to {stamp_ns} ns, "
+            f"{RESTART_FRAMES} frames in a row: a new epoch begins, the target is sought anew"
+        )
+        self._node.get_logger().warning(sentence)
+        self._diagnostics.report(WARN, sentence)
+        self._camera_sent = False
+        self._new_epoch()
 
     def _check_time(self) -> None:
         """A stage that does not answer: a replay ends, a live graph goes on in a new epoch."""

@@ -130,6 +130,10 @@ def test_masks_without_images_do_not_pile_up():
     for stamp in range(1, 1000):
         waiting.add_mask(mask(stamp))
     assert len(waiting._masks) <= 64
+    for stamp in range(1, 10):  # the clock has stepped back
+        waiting.add_mask(mask(stamp))
+        waiting.add_image("/image", image(stamp), stamp)
+        assert waiting.next_frame(Admission(1))[0].stamp_ns == stamp
 
 
 def test_a_new_calibration_is_a_new_epoch_live_and_an_error_in_a_replay():

@@ -95,6 +95,41 @@ def test_a_new_epoch_resets_once_and_gives_up_what_is_incomplete():
     assert (frames.late, len(frames)) == (1, 0)
 
 
+@pytest.mark.parametrize("image_first", [False, True])
+def test_after_a_step_back_the_same_stamps_come_again(image_first):
+    resets = []
+    frames, out = JoinedFrames((topics.FRAME,), PriorConfig(enabled=True, delay_frames=2), lambda: resets.append(1)), []
+    for epoch, focal in ((0, 10.0), (1, 20.0), (2, 30.0)):
+        frames.put_camera(WIRE.camera_info(5 - epoch, "cam", camera(focal)))
+        for stamp in range(5 - epoch, 10):
+            parts = [
+                (topics.ADMISSION, admission(stamp, epoch)),
+                (topics.FRAME, WIRE.frame(stamp, "cam", RGB + epoch, None)),
+            ]
+            for topic, message in reversed(parts) if image_first else parts:
+                frames.put(topic, message)
+            (joined,) = taken(frames)
+            frames.put_status(status(stamp, x=epoch + 0.01 * stamp))
+            image = joined.image()[0]
+            out.append((joined.stamp_ns, image.rgb.max(), image.camera.K[0, 0]))
+            if joined.prior is not None:
+                assert epoch < joined.prior.pose_row[0] < epoch + 0.5, "of this epoch alone"
+        assert joined.prior is not None
+        assert resets == [1] * epoch
+    assert out == [(stamp, e, 10.0 + 10 * e) for e in range(3) for stamp in range(5 - e, 10)]
+    assert (frames.late, len(frames)) == (0, 0)
+
+
+def test_stamps_of_a_restarted_entrance_step_back_within_its_first_epoch():
+    resets = []
+    frames = JoinedFrames((topics.FRAME,), None, lambda: resets.append(1))
+    frames.put_camera(WIRE.camera_info(3, "cam", camera(10.0)))
+    for stamp in (5, 6, 3, 4):
+        put_frame(frames, stamp)
+        assert [joined.stamp_ns for joined in taken(frames)] == [stamp]
+    assert resets == [1]
+
+
 def test_a_lost_message_is_an_error_and_a_missing_one_is_named():
     frames = JoinedFrames((topics.SLAM_STATE,), None, lambda: None)
     frames.put(topics.ADMISSION, admission(1))
