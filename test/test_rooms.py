@@ -39,6 +39,7 @@ BENCH_FLOORS = (
     ("methods",),
     ("runs",),
     ("experiments",),
+    ("campaign",),
 )
 BENCH_FLOOR = {room: number for number, rooms in enumerate(BENCH_FLOORS) for room in rooms}
 

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from types import FrameType
 
 from hat_ros import __version__
-from hat_ros.cli import analyse, bench, check, config, data, run, system
+from hat_ros.cli import analyse, bench, campaign, check, config, data, run, system
 from hat_ros.errors import HatError, InputError, RunError
 
 EXIT_INTERRUPTED = 130
@@ -30,6 +30,7 @@ examples:
   hat track bags/demo --out out/track          the same in this process, no ROS needed
   hat import sequence CLIP --out bags/clip     a folder of images to a bag
   hat bench CLIP CLIP --out out/bench          several methods over several clips, one table
+  hat campaign CAD --out out/campaign          random clips of a CAD model: what share is found
 """
 
 
@@ -43,7 +44,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for group in (run, data, check, analyse, bench, config, system):
+    for group in (run, data, check, analyse, bench, campaign, config, system):
         group.add_commands(commands)
     return parser
 

@@ -80,7 +80,7 @@ def write_report(
         _figure_table(metrics),
         _refusals(metrics.get("refused_reasons", ())),
         "<h2>Over time</h2>",
-        _image(figures.image_bytes(figures.error_figure(log)), "errors over time"),
+        image(figures.image_bytes(figures.error_figure(log)), "errors over time"),
         '<p class="note">Background: state of the output. Crosses: best of the K candidates at keyframes; dots: the '
         "anchor that was chosen; dashed red: alignment dropped. Frames without a pose have no error and lower the "
         "coverage.</p>",
@@ -90,7 +90,7 @@ def write_report(
     if metrics.get("range_bins"):
         parts += [
             "<h2>By range</h2>",
-            _image(figures.image_bytes(figures.range_figure(metrics["range_bins"])), "by range"),
+            image(figures.image_bytes(figures.range_figure(metrics["range_bins"])), "by range"),
         ]
     parts += [
         "<h2>Where it comes from</h2>",
@@ -98,11 +98,20 @@ def write_report(
         "<details><summary>Configuration as used</summary>",
         f"<pre>{html.escape(config_text)}</pre></details>",
     ]
-    page = (
+    path.write_text(page(title, parts), encoding="utf-8")
+
+
+def page(title: str, parts: Sequence[str]) -> str:
+    """A whole HTML page from the pieces of its body."""
+    return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>'
         f"<style>{_STYLE}</style></head><body>{''.join(parts)}</body></html>\n"
     )
-    path.write_text(page, encoding="utf-8")
+
+
+def image(data: bytes, description: str, kind: str = "png") -> str:
+    """An image of this kind as an element of a page, its bytes embedded."""
+    return f'<img alt="{html.escape(description)}" src="data:image/{kind};base64,{base64.b64encode(data).decode()}">'
 
 
 def _figure_table(metrics: dict[str, Any]) -> str:
@@ -123,17 +132,13 @@ def _refusals(reasons: Sequence[dict[str, Any]]) -> str:
     return f"<h2>Frames refused</h2><table>{''.join(rows)}</table>" if rows else ""
 
 
-def _image(data: bytes, description: str, kind: str = "png") -> str:
-    return f'<img alt="{html.escape(description)}" src="data:image/{kind};base64,{base64.b64encode(data).decode()}">'
-
-
 def _strip(frames: Sequence[tuple[str, UInt8]]) -> str:
     cells = []
     for caption, rgb in frames:
         ok, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 82])
         if ok:
             cells.append(
-                f"<figure style='margin:0'>{_image(data.tobytes(), caption, 'jpeg')}"
+                f"<figure style='margin:0'>{image(data.tobytes(), caption, 'jpeg')}"
                 f"<figcaption class='note'>{html.escape(caption)}</figcaption></figure>"
             )
     return f'<div class="strip">{"".join(cells)}</div>'

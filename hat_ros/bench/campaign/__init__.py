@@ -1,0 +1,1 @@
+"""Random clips over everything that decides whether a spacecraft is found, and what came of them."""
