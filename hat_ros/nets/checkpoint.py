@@ -223,7 +223,7 @@ def _refuse_program(path: Path) -> None:
     reader = _import("torch")._C.PyTorchFileReader
     try:
         records = reader(str(path)).get_all_records()
-    except RuntimeError as error:
+    except (RuntimeError, ValueError) as error:  # the second: names that are no UTF-8
         raise WeightsError(f"{path}: is not a readable torch file ({_one_line(error)})") from None
     if any(record == "constants.pkl" or record.startswith("code/") for record in records):
         raise WeightsError(

@@ -201,6 +201,16 @@ def test_a_torchscript_archive_is_refused_before_anything_in_it_runs(folder, toy
     assert "code ran" not in capfd.readouterr().out
 
 
+def test_an_archive_whose_names_are_no_text_is_one_sentence(folder, toy):
+    path = folder / "toy.pth"
+    torch.save({"w": torch.ones(2)}, path)
+    path.write_bytes(path.read_bytes().replace(b"/data.pkl", b"/d\xe8ta.pkl"))
+    toy(path, sha256="")
+    for action in (load_state, convert):
+        with pytest.raises(WeightsError, match=r"toy\.pth: is not a readable torch file \("):
+            action("toy")
+
+
 @pytest.fixture(scope="module")
 def good_droid():
     return {key: torch.zeros_like(value) for key, value in DroidNet(None).state_dict().items()}
