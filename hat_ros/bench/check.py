@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import logging
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
-from hat_ros.array_types import Float, Int, UInt8
+from hat_ros.array_types import Float, Int
+from hat_ros.bench.check_frames import Frames
 from hat_ros.bench.datasets.image_files import ImageRecording
 from hat_ros.bench.source import Source
-from hat_ros.core.refusals import Refusals
-from hat_ros.core.sync import Admission
 from hat_ros.errors import BagError, FrameError
 from hat_ros.geometry import lie
 from hat_ros.io import topics
@@ -27,14 +23,12 @@ from hat_ros.io.topic_choice import CAMERA_INFO_KIND, COMPRESSED_KIND, IMAGE_KIN
 from hat_ros.target.loading import find_model
 from hat_ros.target.model import Target
 from hat_ros.target.symmetry import near_symmetries
-from hat_ros.types import Camera, Frame
+from hat_ros.types import Camera
 
 # A step of more than so many usual ones is a gap.
 _GAP_STEPS = 1.5
 # Masks of another size than the CAD model at the true pose, by this factor, are no matter of occlusion.
 _UNLIKE = 3.0
-# Pixels between those that are looked at for black and saturated ones.
-_STRIDE = 4
 _GREY = 160
 # Symmetries of larger models take longer than a look should.
 _MAX_SYMMETRY_FACES = 100_000
@@ -137,84 +131,15 @@ def _clip_lines(path: Path, recording: ImageRecording) -> Iterator[Line]:
     yield "given masks", f"{masked} of {len(recording)} frames"
 
 
-@dataclass
-class Frames:
-    """What a pass over the frames of a recording finds.
-
-    Attributes:
-        stamps_ns: of all frames looked at, as recorded.
-        refusals: the frames that a run would refuse.
-        encodings: encoding of the images -> count; file suffix for folders.
-        sizes_px: largest side of the box about the given mask, by stamp.
-        black: share of black pixels of each frame.
-        saturated: share of pixels with a saturated channel of each frame.
-        shown: (H, W, 3) first, middle and last of the frames that can be used.
-    """
-
-    stamps_ns: list[int] = field(default_factory=list)
-    refusals: Refusals = field(default_factory=Refusals)
-    encodings: Counter[str] = field(default_factory=Counter)
-    sizes_px: dict[int, float] = field(default_factory=dict)
-    black: list[float] = field(default_factory=list)
-    saturated: list[float] = field(default_factory=list)
-    shown: list[UInt8] = field(default_factory=list)
-
-
-def read_frames(source: Source, limit: int | None = None) -> Frames:
-    """Decode and admit the frames as a run does.
-
-    Args:
-        source: the recording.
-        limit: look at so many frames at most; None = all.
-
-    Raises:
-        InputError: the recording is damaged, or a file of it cannot be read.
-    """
-    out, recording = Frames(), source.recording
-    if isinstance(recording, BagReader):
-        out.stamps_ns = [packet.stamp_ns for packet in islice(recording.packets(), limit)]
-        images = islice(recording.messages(recording.image_topic), limit)
-        out.encodings.update(str(m.format if recording.compressed else m.encoding) for m in images)
-    else:
-        out.stamps_ns = [item.stamp_ns for item in recording.files[:limit]]
-        out.encodings.update(item.image.suffix for item in recording.files[:limit])
-    admission, total = Admission(1), len(out.stamps_ns)
-    wanted, last = [0, total // 2], None
-    for index, frame in enumerate(source.frames(0, limit)):
-        if isinstance(frame, FrameError):
-            out.refusals.add(str(frame))
-            continue
-        try:
-            admission.admit(frame.stamp_ns)
-        except FrameError as error:
-            out.refusals.add(f"frame {frame.stamp_ns}: {error}")
-            continue
-        admission.answered(frame.stamp_ns)
-        _measure(out, frame)
-        last = frame.rgb
-        if wanted and index >= wanted[0]:
-            out.shown.append(frame.rgb)
-            wanted.pop(0)
-    out.shown += [] if last is None else [last]
-    return out
-
-
-def _measure(out: Frames, frame: Frame) -> None:
-    pixels = frame.rgb[::_STRIDE, ::_STRIDE].max(axis=2)
-    out.black.append(float((pixels == 0).mean()))
-    out.saturated.append(float((pixels == 255).mean()))
-    if frame.given_mask is not None and frame.given_mask.any():
-        rows, cols = np.flatnonzero(frame.given_mask.any(axis=1)), np.flatnonzero(frame.given_mask.any(axis=0))
-        out.sizes_px[frame.stamp_ns] = float(max(rows[-1] - rows[0], cols[-1] - cols[0]) + 1)
-
-
 def frame_lines(found: Frames, source: Source) -> Iterator[Line]:
     """The frames: stamps, refusals, encodings, grey levels, size of the target in them.
 
     Raises:
         FrameError: a run could use none of them.
     """
-    yield "frames", f"{len(found.stamps_ns)} looked at of {source.count()}, {found.refusals.total} refused"
+    n = len(found.stamps_ns)
+    sampled = f"; of {found.n_decoded} of them, evenly spread, the images" if found.n_decoded < n else ""
+    yield "frames", f"{n} looked at of {source.count()}, {found.refusals.total} refused{sampled}"
     yield from (("refused", f"{record['count']} x {record['first']}") for record in found.refusals.records())
     yield from _stamp_lines(np.array(found.stamps_ns, dtype=np.int64))
     yield "encoding", ", ".join(f"{name} ({count})" for name, count in found.encodings.items()) or "-"
@@ -243,22 +168,25 @@ def _size_lines(found: Frames, source: Source) -> Iterator[Line]:
     rows = {stamp: truth[stamp] for stamp in found.stamps_ns if stamp in truth}
     every = {stamp: _projected_px(row, camera, target) for stamp, row in rows.items()}
     projected = {stamp: size for stamp, size in every.items() if size > 0}
-    sizes, origin = (found.sizes_px, "given masks") if found.sizes_px else (projected, "ground truth")
-    if not sizes:
-        yield "target in the image", "unknown: neither masks nor ground truth are given"
+    seen = found.sizes_px or found.found_px
+    if not seen and not projected:
+        yield "target in the image", "unknown: neither given masks, nor ground truth, nor a mask that Stage 1 finds"
         return
+    sizes = found.sizes_px or projected or seen
+    origin = "given masks" if found.sizes_px else "ground truth" if projected else "Stage 1 on single frames"
     values = np.array([sizes[stamp] for stamp in sorted(sizes)])
     shown = values[np.linspace(0, len(values) - 1, min(5, len(values))).astype(int)]
     over = ", ".join(f"{value:.0f}" for value in shown)
     yield "target in the image", f"{values.min():.0f} to {values.max():.0f} px, over time {over} px (by {origin})"
     near, far = camera.K[0, 0] * target.diameter_m / np.array([values.max(), values.min()])
     yield "range by size", f"at most {near:.3g} m where it is largest, {far:.3g} m where it is smallest: check the unit"
-    ratios = [found.sizes_px[stamp] / projected[stamp] for stamp in found.sizes_px if projected.get(stamp)]
+    ratios = [seen[stamp] / projected[stamp] for stamp in seen if projected.get(stamp)]
     if ratios and not 1 / _UNLIKE <= np.median(ratios) <= _UNLIKE:
+        masks, other = ("given masks", "") if found.sizes_px else ("masks that Stage 1 finds", ", or give masks")
         yield (
             "warning",
-            f"the given masks are {np.median(ratios):.3g} times as large as the CAD model at the true poses: check "
-            f"unit_scale and the calibration",
+            f"the {masks} are {np.median(ratios):.3g} times as large as the CAD model at the true poses: check "
+            f"unit_scale and the calibration{other}",
         )
 
 

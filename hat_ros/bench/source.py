@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -19,7 +19,7 @@ from hat_ros.config import CameraConfig
 from hat_ros.errors import BagError, DatasetError, FrameError, UsageError
 from hat_ros.geometry import lie
 from hat_ros.io.bag_files import is_bag
-from hat_ros.io.bag_reader import BagReader
+from hat_ros.io.bag_reader import BagReader, Packet
 from hat_ros.io.provenance import input_hash
 from hat_ros.target.loading import find_model, load_target
 from hat_ros.target.mesh_file import companions_of
@@ -137,8 +137,16 @@ class Source:
         """
         stop, recording = None if limit is None else start + limit, self.recording
         if isinstance(recording, BagReader):
-            return _attempts(recording, masks, start, stop)
+            return _attempts(recording, islice(recording.packets(), start, stop), masks)
         return recording.frames(stop, masks, start)
+
+    def frames_at(self, numbers: Collection[int]) -> Iterator[Frame | FrameError]:
+        """The frames of these numbers alone, in order, with masks; a malformed one comes as its error."""
+        recording = self.recording
+        if isinstance(recording, BagReader):
+            chosen = (packet for number, packet in enumerate(recording.packets()) if number in numbers)
+            return _attempts(recording, chosen, masks=True)
+        return replace(recording, files=[recording.files[number] for number in sorted(numbers)]).frames()
 
     def masks(self, start: int = 0, limit: int | None = None) -> Iterator[tuple[int, UInt8 | None]]:
         """Stamps and recorded masks of the same frames, images left alone."""
@@ -164,10 +172,10 @@ class Source:
         return {stamp: lie.row_from_matrix(T) for stamp, T in self.recording.truth().items()}
 
 
-def _attempts(bag: BagReader, masks: bool, start: int, stop: int | None) -> Iterator[Frame | FrameError]:
-    """The frames of a bag; one that cannot be decoded does not end the stream. Those left out are not looked at."""
+def _attempts(bag: BagReader, packets: Iterable[Packet], masks: bool) -> Iterator[Frame | FrameError]:
+    """These frames of a bag; one that cannot be decoded does not end the stream. Those left out are not looked at."""
     decoder = bag.decoder()
-    for packet in islice(bag.packets(), start, stop):
+    for packet in packets:
         try:
             frame = bag.decoded(packet, decoder, masks)
         except FrameError as error:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from hat_ros.cli.options import add_unit_scale
+
 FOOTAGE = ("video", "images")
 
 
@@ -23,21 +25,7 @@ def add_footage(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--fps", type=float, metavar="HZ", help="images per second (default: the film's, 10 of a folder)"
     )
-    group.add_argument(
-        "--unit-scale",
-        type=_unit_scale,
-        default=1.0,
-        metavar="M|auto",
-        help="metres per unit of the CAD file, auto guesses (default: 1, or what a target.yaml says)",
-    )
-
-
-def _unit_scale(text: str) -> float | None:
-    """A number; None for ``auto``."""
-    try:
-        return None if text == "auto" else float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"must be a number or auto, found '{text}'") from None
+    add_unit_scale(group, "of the CAD file")
 
 
 def import_footage(arguments: argparse.Namespace) -> int:
@@ -47,8 +35,8 @@ def import_footage(arguments: argparse.Namespace) -> int:
     from hat_ros.cli.console import count_progress
     from hat_ros.errors import UsageError
 
-    for name in ("sequence", "boxes", "detections", "check"):
-        if getattr(arguments, name):
+    for name in ("sequence", "boxes", "detections", "instance", "check"):
+        if getattr(arguments, name) not in (None, False, []):
             raise UsageError(f"import {arguments.format}: --{name} is for data sets")
     if arguments.model is None:
         raise UsageError(f"import {arguments.format}: name the CAD model with --model")

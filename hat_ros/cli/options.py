@@ -118,6 +118,25 @@ def add_dataset(parser: argparse.ArgumentParser, what: str = "the recording is a
     )
 
 
+def add_unit_scale(parser: argparse._ActionsContainer, whose: str) -> None:
+    """``--unit-scale``; None for ``auto``."""
+    parser.add_argument(
+        "--unit-scale",
+        type=_unit_scale,
+        default=1.0,
+        metavar="M|auto",
+        help=f"metres per unit {whose}, auto guesses (default: 1, or what a target.yaml says)",
+    )
+
+
+def _unit_scale(text: str) -> float | None:
+    """A number; None for ``auto``."""
+    try:
+        return None if text == "auto" else float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be a number or auto, found '{text}'") from None
+
+
 def add_topics(parser: argparse.ArgumentParser) -> None:
     """``--image-topic`` and ``--camera-info-topic``, where a bag is read."""
     parser.add_argument(

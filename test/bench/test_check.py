@@ -1,58 +1,24 @@
 """What `hat check` tells of a recording and a CAD model, and when it says that a run cannot read them."""
 
 import json
+import re
 
 import cv2
 import numpy as np
 import pytest
 import trimesh
-from scripted import CAMERA, frame, mask, stamp, true_row
+from checked_recording import behind, write_bag, write_clip
+from scripted import stamp
 
-from hat_ros.bench.check import Frames, frame_lines, notes, read_frames, recording_lines
+from hat_ros.bench.check import frame_lines, notes, recording_lines
+from hat_ros.bench.check_frames import Frames, read_frames
 from hat_ros.bench.source import open_source
+from hat_ros.bench.synth.clips import ClipSpec, render_clip
 from hat_ros.bench.synth.models import write_model
 from hat_ros.cli import main
 from hat_ros.errors import FrameError
-from hat_ros.geometry import lie
 from hat_ros.io.bag_writer import BagWriter
 from hat_ros.target.loading import load_target
-
-
-class AsWritten(BagWriter):
-    """The bag's time is the order of writing, whatever the stamps are."""
-
-    def write_cdr(self, topic, kind, data, log_ns):
-        self.count = getattr(self, "count", 0) + 1
-        super().write_cdr(topic, kind, data, self.count)
-
-
-def write_bag(folder, indices, masks=True, truth=True, pose=lambda i: lie.matrix_from_row(true_row(i))):
-    model = folder.parent / "cubesat.glb"
-    write_model("cubesat", model)
-    with AsWritten(folder, image_format="png") as writer:
-        for i in indices:
-            given = mask().astype(np.uint8) * np.uint8(255) if masks else None
-            T = pose(i) if truth else None
-            writer.write_frame(stamp(i), frame(i).rgb, CAMERA, mask=given, T_cam_target=T)
-        writer.write_target(model)
-    return folder
-
-
-def behind(index):
-    return lie.transform(np.eye(3), np.array([0.0, 0.0, -5.0 - index]))
-
-
-def write_clip(folder, count=4, size=(64, 48)):
-    (folder / "images").mkdir(parents=True)
-    write_model("cubesat", folder / "target.glb")
-    for i in range(count):
-        image = np.zeros((48, 64, 3), np.uint8)
-        image[:, :16] = 255
-        cv2.imwrite(str(folder / "images" / f"{i}.png"), image)
-    names = [{"file": f"{i}.png"} for i in range(count)]
-    labels = {"K": CAMERA.K.tolist(), "size": list(size), "mesh": "target.glb", "frames": names}
-    (folder / "labels.json").write_text(json.dumps(labels))
-    return folder
 
 
 def told(source):
@@ -88,6 +54,63 @@ def test_size_comes_from_the_truth_where_there_are_no_masks(tmp_path):
     assert unknown["target in the image"].startswith("unknown")
 
 
+def test_a_long_recording_is_sampled_and_says_so(tmp_path, capsys):
+    clip = write_clip(tmp_path / "clip", 30)
+    assert main(["check", str(clip), "--decode", "7"]) == 0
+    assert "30 looked at of 30, 0 refused; of 7 of them" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_sequence_of_a_data_set_is_checked_with_its_detections(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "400")
+    clip = write_clip(tmp_path / "clip")
+    (tmp_path / "found.json").write_text(json.dumps({f"{i}.png": [9.5, 9.5, 29.5, 20.5] for i in range(4)}))
+    given = ["check", str(clip), "--dataset", "sequence", "--sequence", "clip"]
+    assert main([*given, "--detections", str(tmp_path / "found.json"), "--model", str(clip / "target.glb")]) == 0
+    out = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "20 to 20 px" in out and "by given masks" in out
+    assert main(["check", str(clip), "--dataset", "sequence"]) == 2
+    assert "--dataset and --sequence belong together" in capsys.readouterr().err
+
+
+def test_the_unit_of_a_bare_cad_file_can_be_given(tmp_path, capsys):
+    path = tmp_path / "panel.stl"
+    trimesh.creation.box((300.0, 200.0, 100.0)).export(path)
+    assert main(["check", str(path), "--unit-scale", "0.001"]) == 0
+    assert "0.3 x 0.2 x 0.1 m" in capsys.readouterr().out
+    assert main(["check", str(write_clip(tmp_path / "clip")), "--unit-scale", "0.001"]) == 2
+    assert "--unit-scale is for a CAD file alone" in capsys.readouterr().err
+
+
+def rendered_bag(folder, truth=True, unit_scale=1.0):
+    """A target that Stage 1 finds."""
+    model = folder.parent / "cubesat.glb"
+    write_model("cubesat", model)
+    spec = ClipSpec(frames=3, width=160, height=120, focal_px=260.0, range_m=(2.6, 2.3), supersample=1)
+    with BagWriter(folder) as writer:
+        for i, one in enumerate(render_clip(load_target(model), spec)):
+            T = one.T_cam_target if truth else None
+            writer.write_frame(stamp(i), one.rgb, spec.camera, T_cam_target=T)
+        writer.write_target(model, unit_scale)
+    return folder
+
+
+def test_without_masks_and_truth_the_target_is_sought(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "400")
+
+    def lines(bag):
+        assert main(["check", str(bag)]) == 0
+        return " ".join(capsys.readouterr().out.replace("│", " ").split())
+
+    known = lines(rendered_bag(tmp_path / "known"))
+    unknown = lines(rendered_bag(tmp_path / "unknown", truth=False))
+    pattern = r"target in the image (\d+) to (\d+) px, over time [\d, ]+ px \(by ([\w ]+)\)"
+    truth, found = (re.search(pattern, text).groups() for text in (known, unknown))
+    assert (truth[2], found[2]) == ("ground truth", "Stage 1 on single frames")
+    np.testing.assert_allclose([float(x) for x in found[:2]], [float(x) for x in truth[:2]], rtol=0.2)
+    assert "times as large" not in known
+    assert "masks that Stage 1 finds are" in lines(rendered_bag(tmp_path / "small", unit_scale=0.1))
+
+
 def test_masks_that_the_cad_model_does_not_fill_are_warned_of(tmp_path):
     bag = write_bag(tmp_path / "bag", range(3))
     assert "warning" not in told(open_source(bag))
@@ -104,11 +127,6 @@ def test_clip_and_its_grey_levels(tmp_path):
     assert lines["black pixels"] == "75.0%, at most 75.0%"
     assert lines["saturated pixels"] == "25.0%, at most 25.0%"
     assert lines["given masks"] == "0 of 4 frames"
-
-
-def test_limit_leaves_the_rest_unread(tmp_path):
-    found = read_frames(open_source(write_clip(tmp_path / "clip")), 2)
-    assert len(found.stamps_ns) == 2 and sum(found.encodings.values()) == 2
 
 
 def test_recording_without_frames_cannot_run(tmp_path):
