@@ -35,7 +35,8 @@ FLOOR = {room: number for number, rooms in enumerate(FLOORS) for room in rooms}
 BENCH_FLOORS = (
     ("datasets",),
     ("synth", "source", "observations"),
-    ("evaluation", "check", "check_picture"),
+    ("evaluation", "check_frames"),
+    ("check", "check_picture"),
     ("methods",),
     ("runs",),
     ("experiments",),

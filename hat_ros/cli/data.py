@@ -41,6 +41,12 @@ def _add_import(commands: Commands) -> None:
     parser.add_argument(
         "--sequence", action="append", default=[], metavar="NAME", help="only this sequence (repeatable)"
     )
+    parser.add_argument(
+        "--instance",
+        type=natural,
+        metavar="N",
+        help="of several instances of one object in a BOP scene only number N, from 0 on (default: a bag of each)",
+    )
     regions = parser.add_mutually_exclusive_group()
     regions.add_argument(
         "--boxes",
@@ -77,6 +83,7 @@ def _import(arguments: argparse.Namespace) -> int:
             sequences=arguments.sequence,
             boxes=arguments.boxes,
             detections=arguments.detections,
+            instance=arguments.instance,
             check=arguments.check,
             progress=watch,
         )

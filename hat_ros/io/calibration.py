@@ -94,7 +94,7 @@ def _is_rectified(k: Float, p: Float, d: Float, topic: str, option: str) -> bool
     raise FrameError(
         f"camera_info has a matrix for the raw image (k: fx {k[0, 0]:g}, d: {d.tolist()}) and another one for the "
         f"rectified image (p: fx {p[0, 0]:g}), and the topic's name {topic} does not tell which image this is: set "
-        f"rectified to true or false"
+        f"camera.rectified (--rectified) to true or false"
     )
 
 
@@ -102,8 +102,9 @@ def _of_rectified(message: Any, k: Float, p: Float, d: Float) -> Calibration:
     """P counts; K where there is no P and no distortion."""
     if not p.any() and d.any():
         raise FrameError(
-            f"the image is rectified by its topic's name or by the option rectified, but camera_info.p is all zero and "
-            f"d = {d.tolist()}: give the matrix of the rectified image in p, or set rectified to false for a raw image"
+            f"the image is rectified by its topic's name or by camera.rectified, but camera_info.p is all zero and "
+            f"d = {d.tolist()}: give the matrix of the rectified image in p, or set camera.rectified (--rectified) to "
+            f"false for a raw image"
         )
     if not p.any():
         return Calibration(_camera_of(message, k, "k"))

@@ -66,7 +66,7 @@ class Lens:
         if name not in MODELS:
             raise FrameError(
                 f"camera_info.distortion_model '{name}' is not supported with d = {d.tolist()}, use one of "
-                f"{', '.join(MODELS)}, or rectify the image and set rectified to true"
+                f"{', '.join(MODELS)}, or rectify the image and set camera.rectified (--rectified) to true"
             )
         model, most = MODELS[name]
         used = np.trim_zeros(d, "b")

@@ -22,7 +22,7 @@ def choose_image(found: Mapping[str, Topic], given: str | None, encoding_of: Cal
     """The topic of the images.
 
     ``/image`` or ``/image/compressed`` if the recording has it, else the only one that is no depth image; of an image
-    and its compressed copy the image.
+    and its compressed copy the image. Masks (``/detection/mask``) are no camera's images.
 
     Args:
         found: the topics of the recording.
@@ -32,10 +32,10 @@ def choose_image(found: Mapping[str, Topic], given: str | None, encoding_of: Cal
     Raises:
         BagError: there is none, or several; the sentence lists them.
     """
-    every = _of_kinds(found, IMAGE_KIND, COMPRESSED_KIND)
+    every = [name for name in _of_kinds(found, IMAGE_KIND, COMPRESSED_KIND) if name != topics.DETECTION_MASK]
+    names = [name for name in every if found[name].count] or every
     if given is not None:
-        return _given("image", given, every)
-    names = [name for name in every if name != topics.DETECTION_MASK and found[name].count] or every
+        return _given("image", given, every, _cameras(found, names, encoding_of))
     for usual in (topics.IMAGE, topics.IMAGE_COMPRESSED):
         if usual in names:
             return usual
@@ -43,12 +43,7 @@ def choose_image(found: Mapping[str, Topic], given: str | None, encoding_of: Cal
         raise BagError(
             f"has no image topic (Image or CompressedImage), topics are: {', '.join(sorted(found)) or 'none'}"
         )
-    cameras = _without_copies(names)
-    if len(cameras) > 1:
-        cameras = [name for name in cameras if not _DEPTH_NAME.search(name)] or cameras
-    if len(cameras) > 1:
-        raw = {name: encoding_of(name) for name in cameras if found[name].kind == IMAGE_KIND}
-        cameras = [name for name in cameras if raw.get(name) not in _DEPTH_ENCODINGS] or cameras
+    cameras = _cameras(found, names, encoding_of)
     if len(cameras) > 1:
         raise BagError(f"has several image topics, choose one by --image-topic: {', '.join(cameras)}")
     return cameras[0]
@@ -67,7 +62,7 @@ def choose_camera_info(found: Mapping[str, Topic], given: str | None, image: str
     """
     every = _of_kinds(found, CAMERA_INFO_KIND)
     if given is not None:
-        return _given("camera_info", given, every)
+        return _given("camera_info", given, every, every)
     if not every:
         raise BagError(f"has no camera_info topic (CameraInfo), topics are: {', '.join(sorted(found)) or 'none'}")
     names = [name for name in every if found[name].count] or every
@@ -92,11 +87,22 @@ def _of_kinds(found: Mapping[str, Topic], *kinds: str) -> list[str]:
     return sorted(name for name, topic in found.items() if topic.kind in kinds)
 
 
-def _given(what: str, given: str, names: Collection[str]) -> str:
+def _given(what: str, given: str, names: Collection[str], offered: Collection[str]) -> str:
     for name in (given, f"/{given}"):
         if name in names:
             return name
-    raise BagError(f"has no {what} topic '{given}', it has: {', '.join(names) or 'none'}")
+    raise BagError(f"has no {what} topic '{given}', it has: {', '.join(offered) or 'none'}")
+
+
+def _cameras(found: Mapping[str, Topic], names: Collection[str], encoding_of: Callable[[str], str]) -> list[str]:
+    """Of several topics those that are a camera's images: no compressed copies, no depth."""
+    cameras = _without_copies(names)
+    if len(cameras) > 1:
+        cameras = [name for name in cameras if not _DEPTH_NAME.search(name)] or cameras
+    if len(cameras) > 1:
+        raw = {name: encoding_of(name) for name in cameras if found[name].kind == IMAGE_KIND}
+        cameras = [name for name in cameras if raw.get(name) not in _DEPTH_ENCODINGS] or cameras
+    return cameras
 
 
 def _without_copies(names: Collection[str]) -> list[str]:

@@ -218,7 +218,7 @@ def test_option_rectified_chooses_the_matrix(tmp_path, option, share):
     path = calibrated(tmp_path / "bag", [camera_info(p_share=0.9)])
     reader = BagReader(path, camera_config=CameraConfig(rectified=option))
     if share is None:
-        with pytest.raises(FrameError, match="set rectified to true or false"):
+        with pytest.raises(FrameError, match=r"set camera\.rectified \(--rectified\) to true or false"):
             _ = reader.camera
     else:
         assert reader.camera.K[0, 0] == pytest.approx(share * CAMERA.K[0, 0])

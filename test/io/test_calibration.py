@@ -59,7 +59,8 @@ def test_option_and_name_say_which_image_it_is(d, topic, rectified, matrix):
 @pytest.mark.parametrize("topic", ["/image", "/image/compressed", "/direct/image", "/correct/colour"])
 def test_two_matrices_and_a_name_that_does_not_say_is_one_sentence(d, topic):
     with pytest.raises(
-        FrameError, match=r"fx 300.*fx 280.*" + topic + r" does not tell.*set rectified to true or false"
+        FrameError,
+        match=r"fx 300.*fx 280.*" + topic + r" does not tell.*set camera\.rectified \(--rectified\) to true or false",
     ):
         calibration_from(info(d=d, p=P), topic, "auto")
 
@@ -73,7 +74,7 @@ def test_distortion_with_one_matrix_means_a_raw_image(p):
 
 @pytest.mark.parametrize(("topic", "rectified"), [("/image_rect", "auto"), ("/image_raw", "true")])
 def test_a_rectified_image_without_its_matrix_is_one_sentence(topic, rectified):
-    with pytest.raises(FrameError, match=r"camera_info\.p is all zero.*set rectified to false"):
+    with pytest.raises(FrameError, match=r"camera_info\.p is all zero.*set camera\.rectified \(--rectified\) to false"):
         calibration_from(info(d=BARREL, p=np.zeros((3, 3))), topic, rectified)
 
 
@@ -117,7 +118,11 @@ def test_region_and_binning_move_the_matrix_as_they_move_the_pixels():
         (info(d=BARREL, p=np.diag([-1.0, 1, 1])), "/image_rect", r"camera_info\.p: camera matrix"),
         (info(d=(np.nan,) * 5), "/image", r"camera_info\.d must be finite"),
         (info(p=np.full((3, 3), np.inf)), "/image", r"camera_info\.p must be finite"),
-        (info(d=BARREL, model="omnidir"), "/image", "distortion_model 'omnidir' is not supported.*rectified to true"),
+        (
+            info(d=BARREL, model="omnidir"),
+            "/image",
+            r"distortion_model 'omnidir' is not supported.*rectified\) to true",
+        ),
         (info(d=(0.1, 0, 0, 0), model=""), "/image", "distortion_model '' is not supported"),
         (info(d=(0.1,) * 5, model="equidistant"), "/image", "may have 4 coefficients"),
         (info(d=(0.1,) * 15), "/image", "may have 14 coefficients"),

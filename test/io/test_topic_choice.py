@@ -48,6 +48,18 @@ def test_two_cameras_are_listed_and_the_option_is_named():
         choose_image(found, "/nope", lambda _: "rgb8")
 
 
+def test_only_images_of_cameras_are_offered():
+    images = ["/c/color", "/c/aligned", "/c/depth", "/detection/mask"]
+    found = topics_of(images, ["/c/color/compressed", "/d/color/compressed"])
+    encodings = dict.fromkeys(images, "rgb8") | {"/c/aligned": "16UC1"}
+    for wrong in ("/x", "/detection/mask"):
+        with pytest.raises(BagError, match=f"no image topic '{wrong}', it has: /c/color, /d/color/compressed$"):
+            choose_image(found, wrong, encodings.__getitem__)
+    assert choose_image(found, "/c/aligned", encodings.__getitem__) == "/c/aligned", "whoever asks for it gets it"
+    with pytest.raises(BagError, match="has no image topic"):
+        choose_image(topics_of(["/detection/mask"]), None, encodings.__getitem__)
+
+
 @pytest.mark.parametrize(
     ("image", "infos", "chosen"),
     [

@@ -72,10 +72,11 @@ def open_bop(
             mesh = root / "models" / f"obj_{object_id:06d}.ply"
             if not mesh.is_file():
                 raise DatasetError(f"{mesh}: CAD model of object {object_id} in scene {scene.name} is missing")
-            for name, entries in zip(names, instances, strict=True):
+            ids = (int(scene.name), object_id) if scene.name.isdigit() else None
+            for index, (name, entries) in enumerate(zip(names, instances, strict=True)):
                 if not sequences or {scene.name, whole, name} & set(sequences):
                     recording = read_scene(scene, name, mesh, gt, calibration, object_id, listed, entries=entries)
-                    yield replace(recording, scene=(int(scene.name), object_id) if scene.name.isdigit() else None)
+                    yield replace(recording, scene=ids, instance=index if len(names) > 1 else None)
 
 
 def open_ycbv(root: Path, model: Path | None = None, sequences: Collection[str] = ()) -> Iterator[ImageRecording]:

@@ -62,6 +62,7 @@ class ImageRecording:
         mask_value: grey level of the target in the files' masks; None = all above 127.
         scene: (scene, object) numbers of a BOP data set, by which detections of many are told apart.
         image_depth: option ``camera.image_depth``, for 16-bit files.
+        instance: number among several instances of one object in one scene; None = it occurs once.
     """
 
     name: str
@@ -74,6 +75,7 @@ class ImageRecording:
     scene: tuple[int, int] | None = None
     mask_value: int | None = None
     image_depth: str = "auto"
+    instance: int | None = None
 
     def __len__(self) -> int:
         return len(self.files)

@@ -85,6 +85,7 @@ def import_dataset(
     sequences: Collection[str] = (),
     boxes: bool = False,
     detections: str | Path | None = None,
+    instance: int | None = None,
     check: bool = False,
     progress: Progress | None = None,
 ) -> list[Path]:
@@ -100,6 +101,7 @@ def import_dataset(
         boxes: give frames without a mask the box of the CAD at the true pose, see :func:`with_annotation_boxes`.
         detections: masks or boxes computed elsewhere instead of the data set's own, see :func:`with_detections`; a
             folder with ``NAME`` or ``NAME.json`` for each sequence, or what there is of the only one.
+        instance: of several instances of one object only the one of this number; objects that occur once are kept.
         check: also write ``NAME.check.png`` beside each bag, see :func:`check_picture`.
         progress: called with (sequence, frames done, frames in all).
 
@@ -116,6 +118,8 @@ def import_dataset(
     out, bags = own_folder.checked_out(out), []
     recordings: Iterable[ImageRecording] = open_dataset(fmt, root, model, sequences)
     found: dict[str, Path] = {}
+    if instance is not None:
+        recordings = _with_instance(recordings, instance)
     if detections is not None:  # which of them belong to a sequence depends on how many there are
         recordings = every = list(recordings)
         found = detections_by_sequence(Path(detections), every)
@@ -135,6 +139,20 @@ def import_dataset(
             cv2.imwrite(str(bag.with_name(f"{bag.name}.check.png")), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
         bags.append(bag)
     return bags
+
+
+def _with_instance(recordings: Iterable[ImageRecording], number: int) -> list[ImageRecording]:
+    """Those of this instance, and objects that occur once.
+
+    Raises:
+        DatasetError: no object has an instance of this number.
+    """
+    every = list(recordings)
+    if not any(recording.instance == number for recording in every):
+        numbers = sorted({recording.instance for recording in every if recording.instance is not None})
+        found = f"instances have the numbers {numbers[0]} to {numbers[-1]}" if numbers else "no object occurs twice"
+        raise DatasetError(f"no instance {number}: in what is imported {found}")
+    return [recording for recording in every if recording.instance in (None, number)]
 
 
 def _made_from(fmt: str, recording: ImageRecording, boxes: bool, detections: Path | None) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from hat_ros.bench.datasets.image_files import (
     pose_from_label,
     stamp_of,
 )
-from hat_ros.bench.datasets.sequence import read_json
+from hat_ros.bench.datasets.sequence import named_in, read_json
 from hat_ros.bench.datasets.shirt import opencv_distortion
 from hat_ros.errors import DatasetError
 
@@ -104,7 +104,7 @@ def _files(path: Path) -> list[ImageFile]:
         where = f"{path}, entry {index}"
         if not isinstance(entry, dict) or not isinstance(entry.get("filename"), str):
             raise DatasetError(f"{where}: expected a mapping with 'filename'")
-        name = Path(entry["filename"]).name
+        name = named_in(folders[0], entry["filename"], where).name
         image = next((folder / name for folder in folders if (folder / name).is_file()), None)
         if image is None:
             missing += 1

@@ -3,6 +3,7 @@
 import csv
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -671,7 +672,9 @@ def test_an_imported_bag_has_the_textures_of_its_model_in_the_manifest(bop_root,
 # ---------------------------------------------------------------- several instances of one object
 
 
-def test_a_bop_scene_with_two_instances_becomes_two_recordings(tmp_path):
+@pytest.fixture
+def two_instances(tmp_path):
+    """A scene with one object twice, 5 m apart, whose entries stand in another order in the second image."""
     root = tmp_path / "bop"
     scene = root / "test" / "000001"
     write_scene(scene, object_ids=(1, 1))
@@ -685,6 +688,11 @@ def test_a_bop_scene_with_two_instances_becomes_two_recordings(tmp_path):
     for entries, far in zip(gt.values(), (1, 0, 1), strict=True):  # 5 m apart, so that they can be told apart
         entries[far]["cam_t_m2c"][0] += 5000
     (scene / "scene_gt.json").write_text(json.dumps(gt))
+    return root
+
+
+def test_a_bop_scene_with_two_instances_becomes_two_recordings(two_instances):
+    root = two_instances
     first, second = open_dataset("bop", root)
     assert [first.name, second.name] == ["000001_obj1_inst0", "000001_obj1_inst1"]
     for index, (near, far) in enumerate(zip(first.truth().values(), second.truth().values(), strict=True)):
@@ -694,6 +702,18 @@ def test_a_bop_scene_with_two_instances_becomes_two_recordings(tmp_path):
     assert [np.flatnonzero(second.given_mask(item)[:, 0])[0] for item in second.files] == [20, 20, 20]
     assert [r.name for r in open_dataset("bop", root, sequences=["000001_obj1_inst1"])] == ["000001_obj1_inst1"]
     assert len(list(open_dataset("bop", root, sequences=["000001_obj1"]))) == 2
+
+
+def test_one_of_several_instances_is_imported(two_instances, bop_root, tmp_path):
+    out = tmp_path / "bags"
+    bags = import_dataset("bop", two_instances, out, instance=1)
+    assert [bag.name for bag in bags] == ["000001_obj1_inst1"] == [path.name for path in out.iterdir()]
+    rows = list(BagReader(bags[0]).truth_rows().values())
+    np.testing.assert_allclose([row[0] for row in rows], [T[0, 3] + 5.5 for T in POSES], atol=1e-6)
+    with pytest.raises(DatasetError, match="no instance 2: in what is imported instances have the numbers 0 to 1"):
+        import_dataset("bop", two_instances, out, instance=2)
+    with pytest.raises(DatasetError, match="no instance 0: in what is imported no object occurs twice"):
+        import_dataset("bop", bop_root, out, instance=0)
 
 
 # ---------------------------------------------------------------- SPEED, SPEED+
@@ -741,6 +761,18 @@ def test_speed_without_labels_or_with_a_part_of_the_images(speed_root, tmp_path,
     (recording,) = open_dataset("speed", speed_root, mesh, ["sunlamp_test"])
     assert recording.truth() == {} and [item.stamp_ns for item in recording.files] == [stamp_of(1)]
     assert "1 of its 2 images are not there" in caplog.text
+
+
+@pytest.mark.parametrize("name", ["/etc/img000000.jpg", "../img000000.jpg", "images/../img000000.jpg"])
+def test_speed_images_outside_their_folder_are_refused_unread(speed_root, tmp_path, monkeypatch, name):
+    labels = speed_root / "synthetic" / "train.json"
+    entries = json.loads(labels.read_text())
+    labels.write_text(json.dumps([{**entry, "filename": name} for entry in entries]))
+    looked_at, is_file = [], Path.is_file
+    monkeypatch.setattr(Path, "is_file", lambda self: looked_at.append(self.name) or is_file(self))
+    with pytest.raises(DatasetError, match=r"train\.json, entry 0: .* leads out of .*images"):
+        list(open_dataset("speed", speed_root, save_mesh(tmp_path / "tango.stl")))
+    assert "img000000.jpg" not in looked_at
 
 
 @pytest.mark.parametrize(
