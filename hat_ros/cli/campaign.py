@@ -56,6 +56,10 @@ def add_commands(commands: Commands) -> None:
     parser.add_argument("--seed", type=natural, default=1, help="of everything that is drawn (default: 1)")
     parser.add_argument("--frames", type=positive, default=50, metavar="N", help="frames per clip (default: 50)")
     parser.add_argument(
+        "--size", type=positive, nargs=2, default=(640, 480), metavar=("W", "H"), help="image, px (default: 640 480)"
+    )
+    parser.add_argument("--focal", type=float, default=1000.0, metavar="PX", help="focal length, px (default: 1000)")
+    parser.add_argument(
         "--masks",
         choices=("own", "given"),
         default="own",
@@ -110,24 +114,26 @@ def _campaign(arguments: argparse.Namespace) -> int:
 def _tasks(arguments: argparse.Namespace, out: Path) -> list[Task]:
     """The clips that the arguments ask for."""
     from hat_ros.bench.campaign.crafts import crafts_named
-    from hat_ros.bench.campaign.draw import draw_clip
+    from hat_ros.bench.campaign.draw import View, draw_clip
     from hat_ros.bench.campaign.map import CLIPS_PER_CELL, map_cells
     from hat_ros.bench.campaign.run import Task
     from hat_ros.bench.experiments.comparison import GIVEN_MASKS
     from hat_ros.config import load_config
+    from hat_ros.errors import UsageError
 
     given = arguments.masks == "given"
     config = load_config(arguments.config, [*arguments.overrides, *(GIVEN_MASKS if given else ())])
     generated = arguments.generated
     if generated is None:
         generated = 0 if arguments.cad else _DEFAULT_GENERATED
+    if not arguments.focal > 0:
+        raise UsageError(f"campaign: --focal must be positive, found {arguments.focal}")
     crafts = {craft.name: craft for craft in crafts_named(arguments.cad, generated)}
     cells = map_cells() if arguments.map else [None]
     count = arguments.clips or (CLIPS_PER_CELL * len(cells) if arguments.map else 48)
-    drawn = [
-        draw_clip(arguments.seed, index, tuple(crafts), arguments.frames, cells[index % len(cells)])
-        for index in range(count)
-    ]
+    width, height = arguments.size
+    view = View(arguments.frames, width, height, arguments.focal)
+    drawn = [draw_clip(arguments.seed, index, tuple(crafts), view, cells[index % len(cells)]) for index in range(count)]
     return [Task(clip, crafts[clip.craft], config, given, out, arguments.keep_clips) for clip in drawn]
 
 
@@ -143,9 +149,11 @@ def _describe(arguments: argparse.Namespace, tasks: Sequence[Task], out: Path) -
         "seed": arguments.seed,
         "clips": len(tasks),
         "frames": arguments.frames,
+        "size": list(arguments.size),
+        "focal_px": arguments.focal,
         "masks": arguments.masks,
         "map": arguments.map,
-        "crafts": {task.craft.name: task.craft.load().sha256 for task in tasks},
+        "crafts": {task.craft.name: task.craft.sha256() for task in tasks},
         "config": arguments.config,
         "overrides": arguments.overrides,
         "config_sha256": config_hash(tasks[0].config),

@@ -38,6 +38,10 @@ class Craft:
         """
         return _loaded(self)
 
+    def sha256(self) -> str:
+        """Digest of its model; of a generated craft its seed, since the digest of the code goes with it."""
+        return f"generated {self.seed}" if self.path is None else self.load().sha256
+
     def model_file(self, folder: Path) -> ModelFile:
         """Its CAD file; that of a generated craft is written into a folder."""
         if self.path is not None:

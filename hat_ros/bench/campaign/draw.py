@@ -23,7 +23,6 @@ Choice = TypeVar("Choice")
 Band = tuple[float, float]
 
 BACKGROUNDS = ("sky", "earth", "limb")
-FRAMES, WIDTH, HEIGHT, FOCAL_PX = 50, 640, 480, 1000.0
 SIZE_PX: Band = (70.0, 330.0)
 RATE_DEG: Band = (0.3, 4.0)
 
@@ -40,6 +39,31 @@ _ALTITUDE_KM: Band = (300.0, 2000.0)
 _MAX_TILT_DEG = 45.0
 # How far the horizon passes from the middle of the image, as a share of half the image's diagonal.
 _LIMB_OFFSET = 0.6
+
+
+@dataclass(frozen=True)
+class View:
+    """The camera and the length of all clips.
+
+    Attributes:
+        frames: of a clip.
+        width: of the image in pixels.
+        height: of the image in pixels.
+        focal_px: focal length in pixels.
+    """
+
+    frames: int = 50
+    width: int = 640
+    height: int = 480
+    focal_px: float = 1000.0
+
+    @property
+    def half_deg(self) -> float:
+        """Angle from the middle of the image to its corner."""
+        return float(np.degrees(np.arctan(0.5 * np.hypot(self.width, self.height) / self.focal_px)))
+
+
+DEFAULT_VIEW = View()
 
 
 @dataclass(frozen=True)
@@ -113,7 +137,7 @@ def draw_clip(
     seed: int,
     index: int,
     crafts: Sequence[str],
-    frames: int = FRAMES,
+    view: View = DEFAULT_VIEW,
     cell: Cell | None = None,
 ) -> CampaignClip:
     """Draw a clip.
@@ -122,7 +146,7 @@ def draw_clip(
         seed: of the campaign.
         index: number of the clip.
         crafts: names to choose from.
-        frames: length of the clip.
+        view: camera and length of the clip.
         cell: its place on the map, None = drawn freely.
     """
 
@@ -130,7 +154,7 @@ def draw_clip(
         return np.random.default_rng([seed, index, factor])
 
     background = _dealt(seed, index, _BACKGROUND, _DECK_OF_BACKGROUNDS) if cell is None else cell.background
-    earth = None if background == "sky" else _earth(stream(_EARTH), background)
+    earth = None if background == "sky" else _earth(stream(_EARTH), background, view.half_deg)
     to_sun = _to_sun(stream(_SUN), earth, (0.0, 180.0) if cell is None else cell.phase_deg)
     rng = stream(_SIZE)
     first = _log_uniform(rng, *(SIZE_PX if cell is None else cell.size_px))
@@ -141,11 +165,11 @@ def draw_clip(
     rate = _log_uniform(stream(_RATE), *RATE_DEG)
     kind, mismatch = _mismatch(stream(_MISMATCH), _dealt(seed, index, _MISMATCH, _DECK_OF_MISMATCHES))
     film = ClipSpec(
-        frames=frames,
-        width=WIDTH,
-        height=HEIGHT,
-        focal_px=FOCAL_PX,
-        range_m=(FOCAL_PX / first, FOCAL_PX / last),
+        frames=view.frames,
+        width=view.width,
+        height=view.height,
+        focal_px=view.focal_px,
+        range_m=(view.focal_px / first, view.focal_px / last),
         drift=drift,
         start_rotvec=_triple(start),
         spin_axis=_triple(axis),
@@ -185,14 +209,14 @@ def _disc_deg(altitude_km: float) -> float:
     return float(np.degrees(np.arcsin(_EARTH_RADIUS_KM / (_EARTH_RADIUS_KM + altitude_km))))
 
 
-def _earth(rng: np.random.Generator, background: str) -> Earth:
-    """An Earth that fills the image, or whose limb crosses it."""
+def _earth(rng: np.random.Generator, background: str, half_deg: float) -> Earth:
+    """An Earth that fills the image (as far as a very wide one allows), or whose limb crosses it."""
     altitude = _log_uniform(rng, *_ALTITUDE_KM)
-    disc, half_view = _disc_deg(altitude), float(np.degrees(np.arctan(0.5 * np.hypot(WIDTH, HEIGHT) / FOCAL_PX)))
+    disc = _disc_deg(altitude)
     if background == "limb":
-        tilt = disc + _LIMB_OFFSET * half_view * rng.uniform(-1, 1)
+        tilt = disc + _LIMB_OFFSET * half_deg * rng.uniform(-1, 1)
     else:
-        tilt = min(_MAX_TILT_DEG, disc - half_view - 2.0) * np.sqrt(rng.uniform())
+        tilt = max(0.0, min(_MAX_TILT_DEG, disc - half_deg - 2.0)) * np.sqrt(rng.uniform())
     azimuth = rng.uniform(0, 2 * np.pi)
     slant = np.sin(np.radians(tilt))
     nadir = np.array([slant * np.cos(azimuth), slant * np.sin(azimuth), np.cos(np.radians(tilt))])

@@ -40,11 +40,9 @@ def strata_figure(rows: Sequence[dict[str, Any]]) -> Figure:
 
 
 def _label(row: dict[str, Any]) -> str:
-    return row["stratum"] if row["factor"] in ("all", "background", "sensor", "craft") else _named(row)
-
-
-def _named(row: dict[str, Any]) -> str:
-    return f"{row['factor']}: {row['stratum']}"
+    """Names speak for themselves, numbers need their factor."""
+    named = row["factor"] in ("all", "background", "sensor", "craft")
+    return str(row["stratum"]) if named else f"{row['factor']}: {row['stratum']}"
 
 
 def map_figure(rows: Sequence[dict[str, Any]]) -> Figure:
@@ -54,16 +52,24 @@ def map_figure(rows: Sequence[dict[str, Any]]) -> Figure:
         1, len(backgrounds), figsize=(3.6 * len(backgrounds) + 0.8, 3.6), layout="constrained", squeeze=False
     )
     sizes, phases = (_edges(rows, f"{name}_low_{unit}", f"{name}_high_{unit}") for name, unit in _AXES)
+    ranges = {row[f"size_{a}_px"]: row[f"range_{b}_m"] for row in rows for a, b in _NEARER if "range_low_m" in row}
     for axis, background in zip(axes.flat, backgrounds, strict=True):
         mesh = _panel(axis, [row for row in rows if row["background"] == background], sizes, phases)
         axis.set_title(_BACKGROUNDS[background], fontsize=10)
-        axis.set_xlabel("diameter in the image, px", fontsize=9)
+        axis.set_xlabel("diameter in the image, px" + (", and range, m" if ranges else ""), fontsize=9)
+        axis.set_xticks(range(len(sizes)), [_tick(size, ranges) for size in sizes], fontsize=8)
     axes[0, 0].set_ylabel("phase angle, deg (0: sun behind the camera)", fontsize=9)
     figure.colorbar(mesh, ax=axes, label="share of clips found", shrink=0.9)
     return figure
 
 
 _AXES = (("size", "px"), ("phase", "deg"))
+# The larger the craft, the nearer it is.
+_NEARER = (("low", "high"), ("high", "low"))
+
+
+def _tick(size_px: float, ranges: dict[float, float]) -> str:
+    return f"{size_px:.0f}\n{ranges[size_px]:.3g} m" if size_px in ranges else f"{size_px:.0f}"
 
 
 def _edges(rows: Sequence[dict[str, Any]], low: str, high: str) -> list[float]:
@@ -80,6 +86,5 @@ def _panel(axis: Axes, rows: Sequence[dict[str, Any]], sizes: list[float], phase
         axis.annotate(f"{row['found_clips']}/{row['clips']}", place, ha="center", va="center", fontsize=9, color=color)
     mesh = axis.pcolormesh(share, vmin=0, vmax=1, cmap="viridis", edgecolors="white", linewidth=0.8)
     axis.set_facecolor("#e6e6e6")
-    axis.set_xticks(range(len(sizes)), [f"{size:.0f}" for size in sizes], fontsize=8)
     axis.set_yticks(range(len(phases)), [f"{phase:.0f}" for phase in phases], fontsize=8)
     return mesh

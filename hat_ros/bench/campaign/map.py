@@ -31,27 +31,44 @@ def map_cells() -> list[Cell]:
 
 
 def map_table(results: Sequence[Result]) -> Table:
-    """Where it will work: a row per cell of the map."""
+    """Where it will work: a row per cell of the map; ranges in metres where all clips show one craft."""
     cells: dict[tuple[Any, ...], list[Result]] = {}
     for result in results:
         if result.cell is not None:
             key = (result.cell["background"], *result.cell["size_px"], *result.cell["phase_deg"])
             cells.setdefault(key, []).append(result)
+    reach = _reach_px_m(results)
     rows = []
     for (background, *bounds), members in cells.items():
+        row = {"background": background} | dict(zip(_BOUNDS, bounds, strict=True))
+        if reach is not None:
+            row |= {"range_low_m": reach / row["size_high_px"], "range_high_m": reach / row["size_low_px"]}
         found = sum(bool(result.figures["found"]) for result in members)
         low, high = wilson(found, len(members))
-        names = ("size_low_px", "size_high_px", "phase_low_deg", "phase_high_deg")
-        row = {"background": background} | dict(zip(names, bounds, strict=True))
         row |= {"clips": len(members), "found_clips": found, "found": found / len(members)}
         rows.append(row | {"found_low": low, "found_high": high, "first_right": summary(members)["first_right"]})
-    return Table("map: share of clips found", _MAP_COLUMNS, rows)
+    columns = [column for column in _COLUMNS if reach is not None or not column.key.startswith("range")]
+    return Table("map: share of clips found", columns, rows)
 
 
-_MAP_COLUMNS = (
+def _reach_px_m(results: Sequence[Result]) -> float | None:
+    """Size in pixels times range in metres, the same in all clips of one craft; None with several craft."""
+    products = [
+        result.factors["range_first_m"] * result.factors["size_first_px"]
+        for result in results
+        if result.factors["range_first_m"] is not None
+    ]
+    several = len({result.factors["craft"] for result in results}) > 1
+    return None if several or not products else float(products[0])
+
+
+_BOUNDS = ("size_low_px", "size_high_px", "phase_low_deg", "phase_high_deg")
+_COLUMNS = (
     Column("background", "background"),
     Column("size_low_px", "px from", ".0f"),
     Column("size_high_px", "to", ".0f"),
+    Column("range_low_m", "range m from", ".3g"),
+    Column("range_high_m", "to", ".3g"),
     Column("phase_low_deg", "phase from", ".0f"),
     Column("phase_high_deg", "to", ".0f"),
     Column("clips", "clips", "d"),

@@ -74,7 +74,7 @@ class Task:
         """All that determines the result."""
         return {
             "clip": json.loads(json.dumps(asdict(self.clip))),
-            "craft_sha256": self.craft.load().sha256,
+            "craft_sha256": self.craft.sha256(),
             "config_sha256": config_hash(self.config),
             "code_sha256": code_hash(),
             "masks": "given" if self.masks_given else "own",
@@ -87,7 +87,7 @@ class Result:
 
     Attributes:
         index: its number.
-        factors: what it showed, see :meth:`CampaignClip.factors`.
+        factors: what it showed, see :meth:`CampaignClip.factors`, and ``range_first_m``, null if it is not known.
         cell: its place on the map as in :class:`~hat_ros.bench.campaign.draw.Cell`, None = drawn freely.
         figures: see :func:`~hat_ros.bench.campaign.score.figures_of`.
         series: values frame by frame, null where there is none.
@@ -173,9 +173,11 @@ def _played(todo: Sequence[tuple[Task, dict[str, Any]]], n_jobs: int) -> Iterato
 def play_task(task: Task, fingerprint: dict[str, Any]) -> Result:
     """Play a clip and write its file; whatever it raises is its failure."""
     series: dict[str, list[Any]] = {}
+    factors = task.clip.factors() | {"range_first_m": None}
     failure = ""
     try:
         target = task.craft.load()
+        factors["range_first_m"] = task.clip.spec(target.diameter_m).range_m[0]
         film = film_clip(task.clip, target)
         played = play_clip(film, target, task.config, task.masks_given)
         figures = figures_of(played)
@@ -190,7 +192,7 @@ def play_task(task: Task, fingerprint: dict[str, Any]) -> Result:
     record = {
         "index": task.clip.index,
         "fingerprint": fingerprint,
-        "factors": task.clip.factors(),
+        "factors": factors,
         "cell": cell,
         "figures": figures,
         "failure": failure,

@@ -9,7 +9,7 @@ import pytest
 
 from hat_ros.bench.campaign import run
 from hat_ros.bench.campaign.crafts import Craft
-from hat_ros.bench.campaign.draw import draw_clip
+from hat_ros.bench.campaign.draw import View, draw_clip
 from hat_ros.bench.campaign.play import compressed, film_clip
 from hat_ros.bench.campaign.run import Task, play_task, read_results, run_clips
 from hat_ros.bench.synth.models import write_model
@@ -28,10 +28,8 @@ def craft(tmp_path_factory):
 
 
 def small(index, craft, out, **more):
-    clip = draw_clip(1, index, (craft.name,), FRAMES)
-    return Task(
-        replace(clip, film=replace(clip.film, width=160, height=120, focal_px=250.0)), craft, CONFIG, True, out, **more
-    )
+    clip = draw_clip(1, index, (craft.name,), View(FRAMES, 160, 120, 250.0))
+    return Task(clip, craft, CONFIG, True, out, **more)
 
 
 @pytest.fixture(scope="module")
