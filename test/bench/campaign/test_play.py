@@ -63,6 +63,7 @@ def test_errors_are_those_of_computed_poses(told):
     assert has.any()
     assert np.array_equal(has, np.isfinite(told.rotation_deg))
     assert (told.e_p[has] >= np.radians(told.rotation_deg[has]) - 1e-9).all()
+    assert len(told.segmentation_ms) == 4
     assert (told.segmentation_ms <= told.frame_ms).all()
     best = told.best_deg[np.isfinite(told.best_deg)]
     assert len(best)
