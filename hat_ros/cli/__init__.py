@@ -97,6 +97,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.close()
         return 1
     except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            print(f"hat: '{str(error.filename)[:80]}...': {error.strerror}: give a shorter path", file=sys.stderr)
+            return InputError.exit_code
         if error.errno not in _OF_THE_MACHINE or error.filename is None:
             raise
         print(f"hat: {error.filename}: {error.strerror}: choose a place that can be read and written", file=sys.stderr)

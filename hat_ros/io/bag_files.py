@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import heapq
 import io
+import os
 import re
 import shutil
 import tempfile
@@ -143,7 +144,7 @@ def bag_files(path: Path) -> list[Path]:
     if not found:
         raise BagError(f"{path} is no bag: it has neither {METADATA_FILE} nor a file {' or '.join(STORAGE_SUFFIXES)}")
     for file in found:
-        if not file.is_file():
+        if not os.path.isfile(file):  # Path.is_file raises for names that are too long
             raise BagError(f"{path} lacks {file.name}, which its {METADATA_FILE} lists: copy the bag again")
         if not _is_storage(file) and file.suffix != _ROS1_SUFFIX:
             raise BagError(f"{file} is no file of a bag: they end in {' or '.join(STORAGE_SUFFIXES)}")
@@ -184,12 +185,12 @@ def _listed(folder: Path) -> list[Path]:
     except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError):
         raise BagError(f"{path} is damaged: delete it, the bag's files are read without it") from None
     # Of a bag compressed as a whole, some versions list the names before compression.
-    return [folder / name if (folder / name).exists() else _with_zstd(folder / name) for name in names]
+    return [folder / name if os.path.exists(folder / name) else _with_zstd(folder / name) for name in names]
 
 
 def _with_zstd(file: Path) -> Path:
     packed = file.with_name(f"{file.name}.zstd")
-    return packed if packed.exists() else file
+    return packed if os.path.exists(packed) else file
 
 
 def _unpacked(file: Path, out: Path) -> Path:

@@ -341,6 +341,18 @@ def test_a_place_that_cannot_be_written_is_one_sentence(monkeypatch, capsys, num
     assert said.count("\n") == 1 and "/mnt/cdrom/out.json" in said and os.strerror(number) in said
 
 
+@pytest.mark.parametrize("name", ["x" * 300, "x/" * 3000])
+@pytest.mark.parametrize(
+    "words", [["track", "{}", "--out", "o"], ["check", "{}"], ["track", "bags/demo", "--out", "{}"], ["synth", "{}"]]
+)
+def test_a_path_that_is_too_long_is_one_sentence(capsys, name, words):
+    words = [word.format(name) for word in words]
+    assert main([*words, "--out", "o"] if words[0] == "synth" else words) == 2
+    said = capsys.readouterr().err
+    last = said.splitlines()[-1]  # a bar of progress may come before
+    assert "Traceback" not in said and last.startswith("hat: ") and len(last) < 200 and "give a shorter path" in last
+
+
 def test_other_errors_of_the_system_are_bugs_of_ours(monkeypatch):
     def fails(arguments):
         raise OSError(errno.EBADF, "Bad file descriptor", "x")

@@ -192,3 +192,9 @@ def test_metadata_whose_numbers_are_none_is_damaged(bag):
     (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: {version: !!int '', relative_file_paths: []}")
     with pytest.raises(BagError, match="is damaged: delete it"):
         BagReader(bag)
+
+
+def test_metadata_that_lists_a_name_no_file_can_have(bag):
+    metadata_changed(bag, lambda information: information.update(relative_file_paths=["x" * 300]))
+    with pytest.raises(BagError, match="lacks x"):
+        BagReader(bag)

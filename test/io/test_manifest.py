@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
 from hat_ros.errors import BagError
@@ -22,3 +24,10 @@ def test_altered_files_are_noticed_by_the_manifest(bag):
     (bag / MANIFEST).write_text("[1]")
     with pytest.raises(BagError, match="not a manifest"):
         BagReader(bag)
+
+
+def test_a_name_that_no_file_can_have_is_missing(bag):
+    for name in ("x" * 300, "x/" * 3000 + "x"):
+        (bag / MANIFEST).write_text(json.dumps({"sha256": {name: ""}}))
+        with pytest.raises(BagError, match="lacks x"):
+            BagReader(bag)

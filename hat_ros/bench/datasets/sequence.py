@@ -28,7 +28,7 @@ from hat_ros.target.units import AUTO
 from hat_ros.types import Camera
 
 # What file systems take.
-_MAX_NAME_BYTES = 255
+_MAX_NAME_BYTES, _MAX_PATH_BYTES = 255, 1024
 
 
 def load_sequence(folder: str | Path) -> ImageRecording:
@@ -100,7 +100,8 @@ def named_in(folder: Path, name: str, where: str) -> Path:
     Raises:
         DatasetError: an absolute path, one with ``..``, or one that is too long for any file.
     """
-    if max((len(part.encode("utf-8", "replace")) for part in Path(name).parts), default=0) > _MAX_NAME_BYTES:
+    sizes = [len(part.encode("utf-8", "replace")) for part in Path(name).parts]
+    if max(sizes, default=0) > _MAX_NAME_BYTES or sum(sizes) + len(sizes) > _MAX_PATH_BYTES:
         raise DatasetError(f"{where}: {name[:80]!r}... is too long for the name of a file")
     if Path(name).is_absolute() or ".." in Path(name).parts or "\0" in name:
         raise DatasetError(f"{where}: {name[:80]!r} leads out of {folder}: name a file in that folder")

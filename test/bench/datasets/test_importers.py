@@ -208,6 +208,8 @@ def test_complete_bags_are_left_alone_and_interrupted_ones_redone(spark_root, tm
         (lambda labels: labels["frames"][2].update(t_cam_from_target_m=["a", 0, 1]), "not made of numbers"),
         (lambda labels: labels["frames"][2].update(t_cam_from_target_m=[10**400, 0, 1]), "not made of numbers"),
         (lambda labels: labels["frames"][1].update(file="x" * 256), "too long for the name of a file"),
+        (lambda labels: labels["frames"][1].update(file="x/" * 2500), "too long for the name of a file"),
+        (lambda labels: labels.update(mesh="x/" * 2500 + "cad.ply"), "too long for the name of a file"),
     ],
 )
 def test_malformed_sequence_labels(sequence, change, says):
