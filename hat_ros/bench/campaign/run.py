@@ -11,10 +11,11 @@ import os
 import signal
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
+from itertools import islice
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -156,18 +157,21 @@ def read_results(out: Path) -> list[Result]:
 
 def _played(todo: Sequence[tuple[Task, dict[str, Any]]], n_jobs: int) -> Iterator[Result]:
     """Results as they come; when the caller stops, clips that are being played are finished and kept."""
+    waiting = iter(todo)
     with _one_thread(), ProcessPoolExecutor(n_jobs, get_context("spawn"), _prepare_worker) as pool:
         try:
-            for future in as_completed([pool.submit(play_task, *item) for item in todo]):
-                yield future.result()
+            # No clip is submitted before a worker is free: what waits in the pool could not be called off.
+            playing = {pool.submit(play_task, *item) for item in islice(waiting, n_jobs)}
+            while playing:
+                done, playing = wait(playing, return_when=FIRST_COMPLETED)
+                playing |= {pool.submit(play_task, *item) for item in islice(waiting, len(done))}
+                for future in done:
+                    yield future.result()
         except BrokenProcessPool:
             raise RunError(
                 "campaign: a worker process was killed, perhaps for memory; what is done is kept: "
                 "start the same command again, with fewer --jobs"
             ) from None
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
 
 
 def play_task(task: Task, fingerprint: dict[str, Any]) -> Result:

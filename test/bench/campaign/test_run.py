@@ -1,6 +1,7 @@
 """Clips are played once, kept with what determines them, and fail alone."""
 
 import json
+import os
 from dataclasses import replace
 
 import cv2
@@ -138,3 +139,28 @@ def test_compression():
     red = np.zeros((16, 16, 3), np.uint8)
     red[..., 0] = 200
     assert compressed(red, 97)[8, 8, 0] > 190  # channels keep their places
+
+
+def test_a_campaign_that_is_stopped_keeps_what_is_done_and_goes_on(craft, tmp_path):
+    tasks = [small(index, craft, tmp_path) for index in range(3)]
+
+    def stop(result):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_clips(tasks, 1, stop)
+    done = [result.index for result in read_results(tmp_path)]
+    assert done == [0, 1]  # the second one was being played
+    results = run_clips(tasks, 1, lambda result: None)
+    assert [result.reused for result in results] == [True, True, False]
+
+
+def dies(task, fingerprint):
+    os._exit(1)
+
+
+def test_a_worker_that_is_killed_is_one_sentence(craft, tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "play_task", dies)
+    monkeypatch.setattr(Task, "fingerprint", lambda task: {})
+    with pytest.raises(RunError, match="a worker process was killed"):
+        run_clips([small(0, craft, tmp_path)], 1, lambda result: None)
