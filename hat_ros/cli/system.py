@@ -1,4 +1,4 @@
-"""``hat weights``, ``hat doctor`` and ``hat profile``: what is on this machine, and what it can do."""
+"""``hat weights``, ``doctor``, ``prepare`` and ``profile``: what is on this machine, and what it can do."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from hat_ros.cli.options import (
     add_dataset,
     add_threads,
     add_topics,
+    add_unit_scale,
     config_of,
     limit_threads,
     positive,
@@ -23,6 +24,7 @@ def add_commands(commands: Commands) -> None:
     """Register this group."""
     _add_weights(commands)
     _add_doctor(commands)
+    _add_prepare(commands)
     _add_profile(commands)
 
 
@@ -103,6 +105,40 @@ def _doctor(_: argparse.Namespace) -> int:
         table.add_row(finding.what, Text(finding.verdict, style[finding.verdict]), Text(finding.found))
     Console().print(table)
     return 1 if any(finding.verdict == "missing" for finding in findings) else 0
+
+
+def _add_prepare(commands: Commands) -> None:
+    parser = commands.add_parser(
+        "prepare",
+        help="build ahead what the first start with a CAD model builds",
+        description="Build the view banks of a CAD model and compile what is compiled at the first use, so that later "
+        "starts are fast; say how long each part took, and how long it takes from now on. Both are kept in the user's "
+        "cache folder. `hat track`, `hat replay` and the nodes do the same at their first start.",
+    )
+    parser.add_argument("cad", type=Path, metavar="CAD", help="CAD file or target.yaml")
+    add_unit_scale(parser, "of a CAD file")
+    add_config(parser)
+    parser.set_defaults(command=_prepare)
+
+
+def _prepare(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+    from rich.table import Table
+
+    from hat_ros.app.prepare import prepare
+    from hat_ros.target.loading import load_target
+
+    target = load_target(arguments.cad, arguments.unit_scale)
+    config = config_of(arguments)
+    first, again = prepare(config, target), prepare(config, target)
+    table = Table(title=str(arguments.cad))
+    for heading in ("part", "now", "from now on"):
+        table.add_column(heading, justify="left" if heading == "part" else "right")
+    for part, later in zip(first, again, strict=True):
+        table.add_row(part.name, f"{part.seconds:.2f} s", f"{later.seconds:.2f} s")
+    table.add_row("in all", *(f"{sum(part.seconds for part in parts):.2f} s" for parts in (first, again)))
+    Console().print(table)
+    return 0
 
 
 def _add_profile(commands: Commands) -> None:
