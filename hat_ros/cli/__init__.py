@@ -88,8 +88,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as error:
         terminated = isinstance(error, _Terminated)
         print(
-            f"hat: stopped by {'SIGTERM' if terminated else 'Ctrl-C'}; what was done is in the .partial folder, if the "
-            f"command had begun one",
+            f"hat: stopped by {'SIGTERM' if terminated else 'Ctrl-C'}; what was done is in --out or in the .partial "
+            f"folder beside it, if the command had begun one",
             file=sys.stderr,
         )
         return EXIT_TERMINATED if terminated else EXIT_INTERRUPTED

@@ -30,7 +30,7 @@ def strata_figure(rows: Sequence[dict[str, Any]]) -> Figure:
         if level and row["factor"] != rows[level - 1]["factor"]:
             axis.axhline(level - 0.5, color="#cccccc", linewidth=0.7)
     axis.set_yticks(y, [_label(row) for row in rows], fontsize=8)
-    axis.invert_yaxis()
+    axis.set_ylim(len(rows) - 0.4, -0.6)
     axis.set_xlim(-2, 110)
     axis.set_xticks(range(0, 101, 20))
     axis.grid(True, axis="x", alpha=0.3)
