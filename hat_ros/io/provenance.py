@@ -80,8 +80,8 @@ def describe_run(source: Path, source_sha256: str, config: HatConfig, **more: An
 
 @cache
 def code_hash() -> str:
-    """SHA-256 over the package's Python sources: what the code really was, committed or not."""
+    """SHA-256 over the package's Python sources and network weights: what the code really was, committed or not."""
     digest = hashlib.sha256()
-    for item in sorted(_PACKAGE.rglob("*.py")):
+    for item in sorted([*_PACKAGE.rglob("*.py"), *_PACKAGE.rglob("*.onnx")]):
         digest.update(f"{item.relative_to(_PACKAGE)}\0".encode() + item.read_bytes())
     return digest.hexdigest()

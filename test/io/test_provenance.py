@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 from hat_ros.config import HatConfig, config_from_dict
+from hat_ros.io import provenance
 from hat_ros.io.provenance import code_hash, code_version, config_hash, describe_run, input_hash
 
 
@@ -35,3 +36,27 @@ def test_run_description_is_complete(tmp_path):
     assert run["config_sha256"] == config_hash(HatConfig())
     assert run["code"] == code_version()
     assert "numpy" in run["packages"]
+
+
+def test_code_is_sources_and_weights(tmp_path, monkeypatch):
+    (tmp_path / "nets").mkdir()
+    (tmp_path / "stage.py").write_text("LIMIT = 1\n", encoding="utf-8")
+    monkeypatch.setattr(provenance, "_PACKAGE", tmp_path)
+
+    def digest():
+        code_hash.cache_clear()
+        return code_hash()
+
+    try:
+        seen = [digest()]
+        (tmp_path / "nets" / "segmenter.onnx").write_bytes(b"weights")
+        seen.append(digest())
+        (tmp_path / "nets" / "segmenter.onnx").write_bytes(b"better weights")
+        seen.append(digest())
+        (tmp_path / "stage.py").write_text("LIMIT = 2\n", encoding="utf-8")
+        seen.append(digest())
+        assert len(set(seen)) == 4
+        (tmp_path / "notes.txt").write_text("no code", encoding="utf-8")
+        assert digest() == seen[-1]
+    finally:
+        code_hash.cache_clear()
