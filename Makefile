@@ -30,7 +30,7 @@ test-gpu: install-test  ## tests that need an accelerator
 mutation: install-test  ## does the accuracy gate see changed constants? stage by stage, an hour
 	$(BIN)/python tools/mutate.py
 
-fuzz: install-test  ## every reader with changed inputs: HAT_FUZZ_CASES=10000 for each, HAT_FUZZ_SEED=1
+fuzz: install-test  ## changed inputs: HAT_FUZZ_CASES=10000 per reader, a fiftieth through track, HAT_FUZZ_SEED=1
 	HAT_FUZZ_CASES=$${HAT_FUZZ_CASES:-10000} $(PYTEST) -s test/fuzz
 
 lint: install-test  ## ruff: rules and format

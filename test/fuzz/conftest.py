@@ -38,13 +38,13 @@ def _on_alarm(_signal, _frame) -> None:
     raise Hang
 
 
-def _fault(read: Callable[[bytes], object], data: bytes, ends: Counter) -> str:
+def _fault(read: Callable[[bytes], object], data: bytes, ends: Counter, limit_s: float) -> str:
     """What is wrong with how the input ends; empty if nothing."""
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     text = ""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        signal.setitimer(signal.ITIMER_REAL, CASE_LIMIT_S)
+        signal.setitimer(signal.ITIMER_REAL, limit_s)
         try:
             read(data)
             ends["value"] += 1
@@ -56,7 +56,7 @@ def _fault(read: Callable[[bytes], object], data: bytes, ends: Counter) -> str:
                     f"the message has {len(sentence)} characters, {sentence.count(chr(10))} breaks: {sentence!r:.300}"
                 )
         except Hang:
-            text = f"not done after {CASE_LIMIT_S:g} s"
+            text = f"not done after {limit_s:g} s"
         except BaseException as error:  # whatever it is, it is the finding
             if isinstance(error, KeyboardInterrupt):
                 raise
@@ -74,17 +74,27 @@ def _fault(read: Callable[[bytes], object], data: bytes, ends: Counter) -> str:
 
 @pytest.fixture
 def fuzz(tmp_path_factory, record_property):
-    """``fuzz(reader, make, read)``: ``make(rng)`` gives the bytes of a case, ``read(bytes)`` is the reader."""
+    """``fuzz(reader, make, read)``: ``make(rng)`` gives the bytes of a case, ``read(bytes)`` is the reader.
 
-    def run(reader: str, make: Callable[[Random], bytes], read: Callable[[bytes], object]) -> None:
+    ``one_in`` makes a slow reader do only one case of so many, ``limit_s`` gives each of them more time.
+    """
+
+    def run(
+        reader: str,
+        make: Callable[[Random], bytes],
+        read: Callable[[bytes], object],
+        one_in: int = 1,
+        limit_s: float = CASE_LIMIT_S,
+    ) -> None:
+        cases = max(1, CASES // one_in)
         folder: Path = tmp_path_factory.mktemp("offending")
         before, level = signal.signal(signal.SIGALRM, _on_alarm), logging.root.manager.disable
         logging.disable(logging.CRITICAL)
         faults, ends = [], Counter()
         try:
-            for case in range(FIRST, FIRST + CASES):
+            for case in range(FIRST, FIRST + cases):
                 data = make(Random(f"{SEED}/{reader}/{case}"))
-                if fault := _fault(read, data, ends):
+                if fault := _fault(read, data, ends, limit_s):
                     path = folder / f"{reader}-{SEED}-{case}.bin"
                     path.write_bytes(data)
                     again = f"HAT_FUZZ_SEED={SEED} HAT_FUZZ_FIRST={case} HAT_FUZZ_CASES=1"
@@ -93,10 +103,12 @@ def fuzz(tmp_path_factory, record_property):
             logging.disable(level)
             signal.signal(signal.SIGALRM, before)
         record_property(f"fuzz {reader}", dict(ends))
+        peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
         print(
-            f"fuzz {reader}: {CASES} cases, {ends['value']} values, {ends['sentence']} sentences, {len(faults)} faults"
+            f"fuzz {reader}: {cases} cases, {ends['value']} values, {ends['sentence']} sentences, "
+            f"{len(faults)} faults; memory of the process so far {peak_mib} MiB"
         )
         if faults:
-            pytest.fail(f"{len(faults)} of {CASES} cases\n" + "\n".join(faults[:SHOWN]), pytrace=False)
+            pytest.fail(f"{len(faults)} of {cases} cases\n" + "\n".join(faults[:SHOWN]), pytrace=False)
 
     return run
