@@ -20,6 +20,7 @@ sys.path.insert(0, str(ROOT))
 from hat_ros.config import HatConfig, config_to_dict, describe, flat_options, load_config, preset_names  # noqa: E402
 from hat_ros.io import topics  # noqa: E402
 from hat_ros.nets.checkpoint_registry import CHECKPOINTS  # noqa: E402
+from hat_ros.types import StateReason  # noqa: E402
 
 INPUTS, OUTPUTS, STAGES, PEOPLE, RUN = "Inputs", "Outputs", "Between the stages", "For people", "The run itself"
 # Topic -> (group, from and to, how often, what it carries).
@@ -33,7 +34,12 @@ ABOUT: dict[str, tuple[str, str, str, str]] = {
         "any",
         "mono8: 255 silhouette, 128 box; read only with `segmentation.backend: annotated`",
     ),
-    topics.TARGET_POSE: (OUTPUTS, "fusion to GNC", "each frame that has a pose", "the pose `T_cam_target`"),
+    topics.TARGET_POSE: (
+        OUTPUTS,
+        "fusion to GNC",
+        "each frame that is TRACKING or COASTING",
+        "the pose `T_cam_target`; of INITIALISING frames on request (`graph.publish_initialising`)",
+    ),
     topics.TARGET_POSE_WITH_COVARIANCE: (
         OUTPUTS,
         "fusion to filters",
@@ -131,6 +137,13 @@ def column_lists() -> str:
     """Columns of every table topic, in order."""
     rows = ["| Topic | Columns, all FLOAT64 |", "|---|---|"]
     rows += [f"| `{topic}` | {' '.join(f'`{name}`' for name in columns)} |" for topic, columns in TABLES.items()]
+    return "\n".join(rows)
+
+
+def reason_table() -> str:
+    """Number, name and words of every reason for a state."""
+    rows = ["| Reason | Number | Words |", "|---|---|---|"]
+    rows += [f"| `{reason.name}` | {reason.value} | {reason.words} |" for reason in StateReason]
     return "\n".join(rows)
 
 
@@ -233,6 +246,7 @@ def _literal(path: Path, name: str) -> Any:
 GENERATORS: dict[str, Callable[[], str]] = {
     "topics": topic_tables,
     "columns": column_lists,
+    "reasons": reason_table,
     "parameters": parameter_tables,
     "presets": preset_table,
     "weights": weight_table,

@@ -17,8 +17,8 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
-UNINITIALISED, TRACKING, COASTING, LOST = range(4)
-NAMES = {UNINITIALISED: "UNINITIALISED", TRACKING: "TRACKING", COASTING: "COASTING", LOST: "LOST"}
+UNINITIALISED, TRACKING, COASTING, LOST, INITIALISING = range(5)
+NAMES = ("UNINITIALISED", "TRACKING", "COASTING", "LOST", "INITIALISING")
 
 
 def first_row(table: PointCloud2) -> dict[str, float]:

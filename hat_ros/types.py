@@ -345,11 +345,55 @@ class TrackState(IntEnum):
     TRACKING = 1
     COASTING = 2
     LOST = 3
+    INITIALISING = 4
 
     @property
     def has_pose(self) -> bool:
-        """Whether a pose is published in this state."""
+        """Whether there is a pose in this state."""
+        return self.is_confirmed or self is TrackState.INITIALISING
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether the track is or was TRACKING since it was found."""
         return self in (TrackState.TRACKING, TrackState.COASTING)
+
+    def is_published(self, with_initialising: bool) -> bool:
+        """Whether the pose goes out on ``/target_pose``: a confirmed one, others on request."""
+        return self.is_confirmed or (with_initialising and self.has_pose)
+
+
+class StateReason(IntEnum):
+    """Why the output has its state: the ``reason`` column of ``/hat/status``. Numbers keep their meaning for ever."""
+
+    UNSTATED = 0
+    CONFIRMED = 1
+    NOT_FOUND = 2
+    NOT_MEASURED = 3
+    AMBIGUOUS = 4
+    OUTSHONE = 5
+    UNCONFIRMED = 6
+    UNEXPLAINED = 7
+    CONTRADICTED = 8
+    GIVEN_UP = 9
+
+    @property
+    def words(self) -> str:
+        """The reason for people."""
+        return _REASON_WORDS[self]
+
+
+_REASON_WORDS = {
+    StateReason.UNSTATED: "the method states no reason",
+    StateReason.CONFIRMED: "measured in this image, and no other orientation competes",
+    StateReason.NOT_FOUND: "no pose has been found yet",
+    StateReason.NOT_MEASURED: "this image does not support the pose: it is predicted or held",
+    StateReason.AMBIGUOUS: "another orientation is about as likely",
+    StateReason.OUTSHONE: "another orientation looked better at one of the last keyframes",
+    StateReason.UNCONFIRMED: "neither the image nor a second keyframe has confirmed the orientation",
+    StateReason.UNEXPLAINED: "no image so far was explained well, nor have three keyframes agreed",
+    StateReason.CONTRADICTED: "successive keyframes contradict the pose",
+    StateReason.GIVEN_UP: "no image has supported a pose for too long",
+}
 
 
 @dataclass(frozen=True)
@@ -406,6 +450,7 @@ class Estimate:
         n_resets: alignment resets since the start of the run.
         margin: lead of the output's basin over all others at the last keyframe, in units of path score; NaN before
             the first. The smaller, the more ambiguous; for people (diagnostics) and the state.
+        reason: why the state is what it is.
     """
 
     stamp_ns: int
@@ -421,6 +466,7 @@ class Estimate:
     gap_frames: int = 0
     n_resets: int = 0
     margin: float = float("nan")
+    reason: StateReason = StateReason.UNSTATED
 
     @cached_property
     def T_cam_target(self) -> Float:

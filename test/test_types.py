@@ -7,7 +7,7 @@ import pytest
 
 from hat_ros.errors import CandidateError, FrameError
 from hat_ros.geometry import lie
-from hat_ros.types import Camera, Candidates, Detection, Estimate, Frame, Motion, Selection, TrackState
+from hat_ros.types import Camera, Candidates, Detection, Estimate, Frame, Motion, Selection, StateReason, TrackState
 
 K = np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])
 
@@ -106,7 +106,7 @@ def test_selection_without_anchor():
 
 
 def test_only_tracking_and_coasting_have_poses():
-    assert [state.has_pose for state in TrackState] == [False, True, True, False]
+    assert [state.has_pose for state in TrackState] == [False, True, True, False, True]
     estimate = Estimate(1, TrackState.LOST, np.full(7, np.nan), np.full((6, 6), np.nan))
     assert np.isnan(estimate.T_cam_target[:3]).all()
     assert estimate.anchor == -1
@@ -138,3 +138,14 @@ def test_lead_of_candidates_is_over_other_basins_that_survive():
     assert candidates.lead(175.0) == np.inf
     assert np.isnan(Candidates.none().lead(30.0))
     assert np.isnan(Candidates.from_matrices(T, [-np.inf] * 4).lead(30.0))
+
+
+def test_poses_that_were_never_confirmed_are_published_on_request():
+    published = {state.name for state in TrackState if state.is_published(False)}
+    assert published == {"TRACKING", "COASTING"}
+    assert {state.name for state in TrackState if state.is_published(True)} == published | {"INITIALISING"}
+
+
+def test_every_reason_has_words_of_its_own():
+    words = [reason.words for reason in StateReason]
+    assert len(set(words)) == len(words) == 10

@@ -20,6 +20,7 @@ STATE_RGB = {
     TrackState.TRACKING: (80, 255, 120),
     TrackState.COASTING: (255, 200, 60),
     TrackState.LOST: (255, 80, 80),
+    TrackState.INITIALISING: (215, 150, 255),
 }
 TRUTH_RGB = (90, 170, 255)
 _AXES_RGB = ((255, 70, 70), (70, 255, 70), (90, 130, 255))

@@ -23,6 +23,7 @@ STATE_STYLE = {
     TrackState.TRACKING: "green",
     TrackState.COASTING: "yellow",
     TrackState.LOST: "red",
+    TrackState.INITIALISING: "magenta",
 }
 
 

@@ -68,6 +68,12 @@ class GraphConfig:
     credits_replay: int = option(
         4, "credits: frames in flight during replay", level="basic", unit="frames", low=1, high=16
     )
+    publish_initialising: bool = option(
+        False,
+        "send poses of a target that was never confirmed (state INITIALISING) on target_pose, too; they are in status "
+        "and in every record in any case",
+        level="basic",
+    )
     stage_timeout_s: float = option(
         30.0,
         "a stage that takes longer over a frame is an error; networks on a CPU need minutes",

@@ -19,7 +19,7 @@ from hat_ros.core.covariance import ResidualCovariance
 from hat_ros.core.published_fusion import Fused
 from hat_ros.core.selector import rotation_increment
 from hat_ros.geometry import lie
-from hat_ros.types import Detection, Estimate, Frame, Motion, Selection, TrackState
+from hat_ros.types import Detection, Estimate, Frame, Motion, Selection, StateReason, TrackState
 
 _NO_POSE = np.full(7, np.nan)
 _NO_COVARIANCE = np.full((6, 6), np.nan)
@@ -62,8 +62,9 @@ class FusionStage:
     """One :meth:`update` per frame; past outputs are never revised.
 
     States: UNINITIALISED before the first pose. TRACKING while the method is certain of the pose that it solved for.
-    COASTING while the pose is only held, predicted, ambiguous, or in doubt. LOST once ``coast_limit_frames`` went by
-    without a measurement (an anchor, or a supported refinement); no pose then.
+    While the pose is only held, predicted, ambiguous, or in doubt: COASTING if it has been TRACKING since the target
+    was found, else INITIALISING. LOST once ``coast_limit_frames`` went by without a measurement (an anchor, or a
+    supported refinement); no pose then, and what is found afterwards has to be confirmed anew.
     """
 
     def __init__(self, config: HatConfig, method: FusionMethod) -> None:
@@ -76,7 +77,12 @@ class FusionStage:
         self._method.reset()
         self._start()
 
+    def resume(self) -> None:
+        """The target was confirmed before this stage was started or reset: until it is lost, a pose is no first one."""
+        self._is_confirmed = True
+
     def _start(self) -> None:
+        self._is_confirmed = False
         self._covariance = ResidualCovariance()
         self._last_pose: Float | None = None
         self._last_quat = np.array([0.0, 0.0, 0.0, 1.0])
@@ -92,7 +98,7 @@ class FusionStage:
         self._n_resets += fused.reset
         if fused.T_cam_target is not None and selection.selected >= 0:
             self._margin = selection.margin(fused.T_cam_target[:3, :3], self._config.fusion.gate_angle_deg)
-        state, T_cam_target = self._state(fused, motion)
+        state, reason, T_cam_target = self._state(fused, motion)
         pose_row, covariance = _NO_POSE, _NO_COVARIANCE
         if state.has_pose and T_cam_target is not None:
             pose_row = self._row(T_cam_target)
@@ -113,21 +119,26 @@ class FusionStage:
             gap_frames=self._gap_frames,
             n_resets=self._n_resets,
             margin=self._margin,
+            reason=reason,
         )
 
-    def _state(self, fused: Fused, motion: Motion) -> tuple[TrackState, Float | None]:
-        """State and pose after gap handling."""
+    def _state(self, fused: Fused, motion: Motion) -> tuple[TrackState, StateReason, Float | None]:
+        """State, why, and pose after gap handling."""
         T_cam_target = self._fill_gap(motion) if fused.T_cam_target is None else fused.T_cam_target
         if T_cam_target is None and not self._lost:
-            return TrackState.UNINITIALISED, None
+            return TrackState.UNINITIALISED, StateReason.NOT_FOUND, None
         self._gap_frames = 0 if fused.measurement is not None else self._gap_frames + 1
         self._lost = self._gap_frames > (0 if self._lost else self._config.fusion.coast_limit_frames)
         if self._lost:
             self._method.lose()
             self._last_pose = None
-            return TrackState.LOST, None
+            self._is_confirmed = False
+            return TrackState.LOST, StateReason.GIVEN_UP, None
         self._last_pose = T_cam_target
-        return (TrackState.TRACKING if fused.certain else TrackState.COASTING), T_cam_target
+        if fused.reason == StateReason.CONFIRMED:
+            self._is_confirmed = True
+            return TrackState.TRACKING, fused.reason, T_cam_target
+        return (TrackState.COASTING if self._is_confirmed else TrackState.INITIALISING), fused.reason, T_cam_target
 
     def _fill_gap(self, motion: Motion) -> Float | None:
         """The last pose, held, or turned by the SLAM rotation about a held position."""

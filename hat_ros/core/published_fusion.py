@@ -17,7 +17,7 @@ from hat_ros.core.inertia import InertialPrior
 from hat_ros.core.pose_solver import PoseProblem, solve_pose
 from hat_ros.core.selector import box_area_px
 from hat_ros.geometry import lie
-from hat_ros.types import Detection, Frame, Motion, Selection
+from hat_ros.types import Detection, Frame, Motion, Selection, StateReason
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Fused:
         reset: the alignment was dropped at this frame.
         measurement: (4, 4) what this frame's own image measures, None when there is no measurement.
         covariance: (6, 6) of the measurement, None when its source does not know.
-        certain: the output is to be called TRACKING.
+        reason: CONFIRMED if the output is to be called TRACKING, else why not.
     """
 
     T_cam_target: Float | None
@@ -40,7 +40,7 @@ class Fused:
     reset: bool = False
     measurement: Float | None = None
     covariance: Float | None = None
-    certain: bool = False
+    reason: StateReason = StateReason.NOT_MEASURED
 
 
 class PublishedFusion:
@@ -74,7 +74,7 @@ class PublishedFusion:
         if anchor is not None:
             confidence = self._area_confidence.update(box_area_px(selection.candidates.box_xyxy))
         fused = self.advance(motion, anchor, confidence)
-        return replace(fused, certain=fused.T_cam_target is not None)
+        return fused if fused.T_cam_target is None else replace(fused, reason=StateReason.CONFIRMED)
 
     def spread(self, selection: Selection, T_cam_target: Float) -> Float:
         """Zero (6, 6): here the anchors are the residuals, their spread is known already."""

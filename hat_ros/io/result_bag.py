@@ -32,13 +32,15 @@ class ResultBagWriter:
         path: folder to create.
         frame_id: ``header.frame_id`` of the images.
         target_frame_id: name of the target frame, child of the alignment's.
+        publish_initialising: option ``graph.publish_initialising``.
     """
 
-    def __init__(self, path: Path, frame_id: str, target_frame_id: str) -> None:
+    def __init__(self, path: Path, frame_id: str, target_frame_id: str, publish_initialising: bool = False) -> None:
         self._bag = BagWriter(path, frame_id=frame_id)
         self._wire = messages.Wire.bag(TYPESTORE)
         self._frame_id = frame_id
         self._target_frame_id = target_frame_id
+        self._publish_initialising = publish_initialising
         self._alignment: Alignment | None = None
         self._seq = 0
         self._first_stamp_ns: int | None = None
@@ -92,7 +94,7 @@ class ResultBagWriter:
             self._write(topics.ALIGNMENT_TRANSFORM, transform, stamp)
         self._alignment = alignment
         self._write(topics.STATUS, make.status(frame_id, estimate, admitted), stamp)
-        if estimate.state.has_pose:
+        if estimate.state.is_published(self._publish_initialising):
             row, covariance = estimate.pose_row, estimate.covariance
             self._write(topics.TARGET_POSE, make.pose(stamp, frame_id, row), stamp)
             message = make.pose_with_covariance(stamp, frame_id, row, covariance)

@@ -21,6 +21,7 @@ class RunLog:
     Attributes:
         stamp_ns: (N,) exposure stamps.
         state: (N,) :class:`~hat_ros.types.TrackState` values.
+        reason: (N,) :class:`~hat_ros.types.StateReason` values.
         pose_rows: (N, 7) output ``T_cam_target``.
         covariance: (N, 6, 6) of the output, ``[translation; rotation vector]``.
         keyframe: (N,) candidates were available.
@@ -38,6 +39,7 @@ class RunLog:
 
     stamp_ns: Int
     state: Int
+    reason: Int
     pose_rows: Float
     covariance: Float
     keyframe: Bool
@@ -58,7 +60,7 @@ class RunLog:
     @cached_property
     def T_est(self) -> Float:
         """(N, 4, 4) outputs, NaN where the state has none."""
-        has = np.isin(self.state, (TrackState.TRACKING, TrackState.COASTING))
+        has = np.isin(self.state, [state for state in TrackState if state.has_pose])
         return lie.matrix_from_row(np.where(has[:, None], self.pose_rows, np.nan))
 
     @cached_property
@@ -68,7 +70,7 @@ class RunLog:
 
     @cached_property
     def has_output(self) -> Bool:
-        """(N,) a pose was published."""
+        """(N,) there is a pose, published or not."""
         return np.asarray(np.isfinite(self.T_est).all(axis=(-1, -2)))
 
     @cached_property
@@ -120,6 +122,7 @@ class RunLogBuilder:
             {
                 "stamp_ns": estimate.stamp_ns,
                 "state": int(estimate.state),
+                "reason": int(estimate.reason),
                 "pose_rows": estimate.pose_row,
                 "covariance": estimate.covariance,
                 "keyframe": estimate.keyframe,
@@ -139,6 +142,7 @@ class RunLogBuilder:
         for row, estimate in zip(self._rows, estimates, strict=bool(estimates)):
             row |= {
                 "state": int(estimate.state),
+                "reason": int(estimate.reason),
                 "pose_rows": estimate.pose_row,
                 "covariance": estimate.covariance,
                 "anchor": estimate.anchor,
@@ -149,6 +153,7 @@ class RunLogBuilder:
         shapes: dict[str, tuple[type, tuple[int, ...]]] = {
             "stamp_ns": (np.int64, ()),
             "state": (np.int64, ()),
+            "reason": (np.int64, ()),
             "pose_rows": (np.float64, (7,)),
             "covariance": (np.float64, (6, 6)),
             "keyframe": (np.bool_, ()),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,10 @@ from hat_ros.errors import WireError
 from hat_ros.io import topics
 from hat_ros.io.message_family import stamp_of
 from hat_ros.io.table import TableWire, check_poses, flag, one_row, read_table, whole_number
-from hat_ros.types import Alignment, Candidates, Estimate, Motion, Selection, TrackState
+from hat_ros.types import Alignment, Candidates, Estimate, Motion, Selection, StateReason, TrackState
+
+# The elements of a covariance (6, 6) that are sent.
+_UPPER = np.triu_indices(6)
 
 
 @dataclass(frozen=True)
@@ -23,16 +26,19 @@ class Admitted:
         seq: number of the frame since the start of the run, from 0.
         dropped_total: frames not admitted so far (live drops, rejected stamps or images).
         epoch: counts resets of the graph; a new one tells every stage to start afresh at this frame.
+        resumed: 1 if this epoch goes on with a target that was confirmed in the one before: a stage was lost, not the
+            target.
     """
 
     seq: int
     dropped_total: int
     epoch: int
+    resumed: int = 0
 
 
 @dataclass(frozen=True)
 class Status:
-    """One row of ``/hat/status``: the estimate (without covariance and alignment) and its place in the run."""
+    """One row of ``/hat/status``: the estimate (without alignment) and its place in the run."""
 
     estimate: Estimate
     seq: int
@@ -45,7 +51,7 @@ class StageWire(TableWire):
 
     def admission(self, stamp_ns: int, frame_id: str, admitted: Admitted) -> Any:
         """Table of ``/hat/admission``."""
-        row = np.array([[admitted.seq, admitted.dropped_total, admitted.epoch]], dtype=np.float64)
+        row = np.array([astuple(admitted)], dtype=np.float64)
         return self.table(stamp_ns, frame_id, topics.ADMISSION_COLUMNS, row)
 
     def candidates(self, stamp_ns: int, frame_id: str, candidates: Candidates) -> Any:
@@ -77,7 +83,7 @@ class StageWire(TableWire):
         version = 0 if e.alignment is None else e.alignment.version
         head = [e.state, admitted.seq, e.keyframe, e.n_candidates, e.anchor, e.gate_weight]
         tail = [version, e.slam_epoch, e.gap_frames, admitted.dropped_total]
-        row = np.concatenate([head, tail, e.pose_row])
+        row = np.concatenate([head, tail, e.pose_row, [e.reason], e.covariance[_UPPER]])
         return self.table(e.stamp_ns, frame_id, topics.STATUS_COLUMNS, row)
 
 
@@ -152,11 +158,12 @@ def alignment_from(message: Any) -> Alignment:
 
 
 def status_from(message: Any) -> Status:
-    """Decode ``/hat/status``; covariance and alignment have topics of their own."""
-    row = one_row(message, topics.STATUS_COLUMNS)
+    """Decode ``/hat/status``; the alignment has a topic of its own. Reason and covariance are missing in old bags."""
+    row = one_row(message, topics.STATUS_COLUMNS, topics.N_STATUS_AT_FIRST)
     state = whole_number("state", row["state"])
     if state not in set(TrackState):
-        raise WireError(f"column 'state' must be 0 to 3, found {state}")
+        raise WireError(f"column 'state' must be 0 to {max(TrackState)}, found {state}")
+    reason = 0 if np.isnan(row["reason"]) else whole_number("reason", row["reason"])
     pose_row = np.array([row[name] for name in topics.POSE_COLUMNS])
     if TrackState(state).has_pose:
         check_poses(pose_row)
@@ -164,13 +171,15 @@ def status_from(message: Any) -> Status:
         stamp_of(message),
         TrackState(state),
         pose_row,
-        np.full((6, 6), np.nan),
+        _covariance(row),
         keyframe=flag("keyframe", row["keyframe"]),
         n_candidates=whole_number("n_candidates", row["n_candidates"]),
         anchor=whole_number("anchor", row["anchor"], low=-1),
         gate_weight=row["gate_weight"],
         slam_epoch=whole_number("slam_epoch", row["slam_epoch"]),
         gap_frames=whole_number("gap_frames", row["gap_frames"]),
+        # A reason that a newer writer knows is none to this reader.
+        reason=StateReason(reason) if reason in set(StateReason) else StateReason.UNSTATED,
     )
     return Status(
         estimate,
@@ -178,3 +187,11 @@ def status_from(message: Any) -> Status:
         whole_number("dropped_total", row["dropped_total"]),
         whole_number("alignment_version", row["alignment_version"]),
     )
+
+
+def _covariance(row: dict[str, float]) -> Float:
+    """(6, 6) of a status row, NaN without one."""
+    covariance = np.empty((6, 6))
+    elements = [row[f"cov{i}{j}"] for i, j in zip(*_UPPER, strict=True)]
+    covariance[_UPPER] = covariance.T[_UPPER] = elements
+    return covariance

@@ -2,7 +2,8 @@
 
 It is the one message of ROS's common packages that is atomic, stamped, exact and takes any number of rows.
 
-Names, order, types and sizes are checked; anything else is a :class:`~hat_ros.errors.WireError`.
+Names, order, types and sizes are checked; anything else is a :class:`~hat_ros.errors.WireError`. A table may grow at
+its end only.
 """
 
 from __future__ import annotations
@@ -57,14 +58,22 @@ class TableWire(MessageFamily):
         return list(self._fields[columns])
 
 
-def read_table(message: Any, columns: tuple[str, ...]) -> Float:
+def read_table(message: Any, columns: tuple[str, ...], n_first: int | None = None) -> Float:
     """(N, C) float64 rows of a table message.
+
+    Args:
+        message: a PointCloud2.
+        columns: the names that it must have, in this order.
+        n_first: of a table that grew, how many columns it had at first. Those of an older writer that are missing
+            behind them are NaN; what a newer one adds at the end is left out. None: just these columns.
 
     Raises:
         WireError: names, order, types, sizes or byte order are not exactly those promised.
     """
     names = tuple(field.name for field in message.fields)
-    if names != columns:
+    low, high = (len(columns), len(columns)) if n_first is None else (n_first, len(names))
+    n_known = min(len(names), len(columns))
+    if not low <= len(names) <= high or names[:n_known] != columns[:n_known]:
         raise WireError(f"table columns must be {' '.join(columns)}, found {' '.join(names) or 'none'}")
     for i, field in enumerate(message.fields):
         if (field.offset, field.datatype, field.count) != (8 * i, _FLOAT64, 1):
@@ -72,7 +81,7 @@ def read_table(message: Any, columns: tuple[str, ...]) -> Float:
                 f"table column '{field.name}' must be one FLOAT64 at offset {8 * i}, found datatype {field.datatype}, "
                 f"count {field.count}, offset {field.offset}"
             )
-    step, n = 8 * len(columns), message.width
+    step, n = 8 * len(names), message.width
     if message.is_bigendian or message.height != 1 or message.point_step != step or message.row_step != step * n:
         raise WireError(
             f"table must be little-endian, height 1, point_step {step}, row_step {step * n}; found bigendian "
@@ -81,16 +90,18 @@ def read_table(message: Any, columns: tuple[str, ...]) -> Float:
         )
     if len(message.data) != step * n:
         raise WireError(f"table of {n} rows must hold {step * n} bytes, found {len(message.data)}")
-    return np.frombuffer(message.data, dtype="<f8").reshape(n, len(columns)).astype(np.float64)
+    rows = np.full((n, len(columns)), np.nan)
+    rows[:, :n_known] = np.frombuffer(message.data, dtype="<f8").reshape(n, len(names))[:, :n_known]
+    return rows
 
 
-def one_row(message: Any, columns: tuple[str, ...]) -> dict[str, float]:
-    """Column -> value of a table with exactly one row.
+def one_row(message: Any, columns: tuple[str, ...], n_first: int | None = None) -> dict[str, float]:
+    """Column -> value of a table with exactly one row; arguments of :func:`read_table`.
 
     Raises:
         WireError: see :func:`read_table`, or another number of rows.
     """
-    rows = read_table(message, columns)
+    rows = read_table(message, columns, n_first)
     if len(rows) != 1:
         raise WireError(f"table must have one row, found {len(rows)}")
     return dict(zip(columns, rows[0].tolist(), strict=True))

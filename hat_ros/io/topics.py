@@ -96,5 +96,10 @@ STATUS_COLUMNS = (
     "gap_frames",
     "dropped_total",
     *POSE_COLUMNS,
+    "reason",
+    # Upper triangle, row by row.
+    *(f"cov{i}{j}" for i in range(6) for j in range(i, 6)),
 )
-ADMISSION_COLUMNS = ("seq", "dropped_total", "epoch")
+# Those of the first release: columns are added at the end only, and readers accept fewer and more from here on.
+N_STATUS_AT_FIRST = 17
+ADMISSION_COLUMNS = ("seq", "dropped_total", "epoch", "resumed")

@@ -17,7 +17,7 @@ from hat_ros.ros.pose_output import PoseOutput
 from hat_ros.ros.session import Session
 from hat_ros.ros.stage_node import StageSession
 from hat_ros.tracker import choose_fusion
-from hat_ros.types import Camera, Detection, Frame
+from hat_ros.types import Camera, Detection, Estimate, Frame
 
 # Without a refiner only the frame's stamp counts, so no image is sent here.
 _NO_CAMERA = Camera(np.eye(3), 1, 1)
@@ -34,25 +34,35 @@ class FusionSession(StageSession):
         images = (topics.FRAME,) if config.refinement.enabled else ()
         super().__init__(node, self._stage, (topics.SLAM_STATE, topics.SELECTION, *images))
         self._wire = node.wire
-        self._margin = float("nan")
+        self._estimate: Estimate | None = None
         readers = ("hypotheses", "slam") if config.prior.enabled else ()
         self._status = node.endpoints.output(topics.STATUS, "segmentation", *readers)
-        self._pose = PoseOutput(node.endpoints, node.wire, settings.target_frame_id or target.name)
+        frame_id = settings.target_frame_id or target.name
+        self._pose = PoseOutput(node.endpoints, node.wire, frame_id, config.graph.publish_initialising)
+        self._resumed_epoch = -1
 
     def step(self, joined: JoinedFrame) -> None:
         """Estimate of one frame; the status goes last, because it lets the next frame in."""
+        admitted = joined.admitted
+        if admitted.resumed and admitted.epoch != self._resumed_epoch:
+            self._resumed_epoch = admitted.epoch
+            self._stage.resume()
         frame, detection = _image(joined)
         motion = messages.motion_from(joined.items[topics.SLAM_STATE])
         selection = messages.selection_from(joined.items[topics.SELECTION])
         estimate = self._stage.update(frame, detection, motion, selection)
         self._pose.publish(joined.frame_id, estimate)
-        self._margin = estimate.margin
-        self._status.publish(self._wire.status(joined.frame_id, estimate, joined.admitted))
-        self._diagnostics.report(OK, estimate.state.name.lower())
+        self._estimate = estimate
+        self._status.publish(self._wire.status(joined.frame_id, estimate, admitted))
+        self._diagnostics.report(OK, f"{estimate.state.name.lower()}: {estimate.reason.words}")
 
     def values(self) -> dict[str, Any]:
         """Figures for diagnostics; the smaller the margin, the more ambiguous the orientation."""
-        return {**super().values(), "margin": self._margin}
+        if self._estimate is None:
+            return super().values()
+        e = self._estimate
+        own = {"state": int(e.state), "reason": int(e.reason), "margin": e.margin, "gap_frames": e.gap_frames}
+        return {**super().values(), **own}
 
 
 def _image(joined: JoinedFrame) -> tuple[Frame, Detection | None]:

@@ -19,11 +19,13 @@ class PoseOutput:
         endpoints: where the publishers are created.
         wire: encodes messages.
         target_frame_id: name of the target (CAD) frame.
+        publish_initialising: option ``graph.publish_initialising``.
     """
 
-    def __init__(self, endpoints: Endpoints, wire: Wire, target_frame_id: str) -> None:
+    def __init__(self, endpoints: Endpoints, wire: Wire, target_frame_id: str, publish_initialising: bool) -> None:
         self._wire = wire
         self._target_frame_id = target_frame_id
+        self._publish_initialising = publish_initialising
         self._version = 0
         self._pose = endpoints.output(topics.TARGET_POSE)
         self._with_covariance = endpoints.output(topics.TARGET_POSE_WITH_COVARIANCE)
@@ -32,9 +34,9 @@ class PoseOutput:
         self._tf = endpoints.output(topics.TF) if find_spec("tf2_msgs") else None
 
     def publish(self, frame_id: str, estimate: Estimate) -> None:
-        """Publish the alignment if it changed, and the pose if the state has one."""
+        """Publish the alignment if it changed, and the pose if it was confirmed or others are asked for."""
         self._publish_alignment(estimate)
-        if estimate.state.has_pose:
+        if estimate.state.is_published(self._publish_initialising):
             self._publish_pose(frame_id, estimate)
 
     def _publish_pose(self, frame_id: str, estimate: Estimate) -> None:

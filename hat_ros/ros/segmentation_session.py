@@ -22,7 +22,7 @@ from hat_ros.ros.pacing import ExtraDelay, StepTimer
 from hat_ros.ros.session import Session
 from hat_ros.segmentation.stage import SegmentationStage
 from hat_ros.tracking.prior import PriorBuffer
-from hat_ros.types import Frame
+from hat_ros.types import Frame, TrackState
 
 _STAGES = {"hypotheses", "slam", "selector", "fusion"}
 
@@ -42,6 +42,7 @@ class SegmentationSession(Session):
         # A record tells frames by their stamps: there none may come twice.
         self._in_flight = FramesInFlight(config.graph, live, restarts=live and not node.settings.recorded)
         self._epoch = 0
+        self._last_state, self._resumed = TrackState.UNINITIALISED, False
         self._camera_sent = self._is_open = False
         self._ready_nodes: set[str] = set()
         self._delay = ExtraDelay(node.NAME, config.graph.debug_stage_delay_ms)
@@ -125,6 +126,7 @@ class SegmentationSession(Session):
     def _on_status(self, message: Any) -> None:
         estimate = messages.status_from(message).estimate
         self._priors.push(estimate)
+        self._last_state = estimate.state
         if self._in_flight.leave(estimate.stamp_ns):
             self._diagnostics.report(OK, "running")
         self._pump()
@@ -162,7 +164,7 @@ class SegmentationSession(Session):
             self._camera_info.publish(self._wire.camera_info(stamp_ns, frame_id, frame.camera))
             self._camera_info.wait_for_all_acked(Duration(seconds=5))  # it must be there before its first image
         seq = self._in_flight.enter(stamp_ns)
-        admitted = messages.Admitted(seq, self._entrance.dropped_total, self._epoch)
+        admitted = messages.Admitted(seq, self._entrance.dropped_total, self._epoch, int(self._resumed))
         self._admission.publish(self._wire.admission(stamp_ns, frame_id, admitted))
         self._delay.wait()
         with self._step_timer.frame():
@@ -184,14 +186,18 @@ class SegmentationSession(Session):
         """A stage that does not answer: a replay ends, a live graph goes on in a new epoch."""
         overdue = self._in_flight.overdue()
         if overdue is not None:
-            self._new_epoch()
+            self._new_epoch(resumed=self._last_state.is_confirmed)
             self._is_open = False
             self._node.fail(overdue)
         elif self._is_open and len(self._entrance) and not self._entrance.is_calibrated:
             self._diagnostics.report(WARN, f"images arrive, but no calibration on {topics.CAMERA_INFO}")
         self._pump()
 
-    def _new_epoch(self) -> None:
+    def _new_epoch(self, resumed: bool = False) -> None:
+        """Every stage starts afresh; ``resumed``: with a target that was confirmed and has not been lost."""
         self._epoch += 1
+        self._resumed = resumed
+        if not resumed:
+            self._last_state = TrackState.UNINITIALISED
         self._stage.reset()
         self._priors.reset()

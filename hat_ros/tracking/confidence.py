@@ -8,7 +8,7 @@ import numpy as np
 
 from hat_ros.array_types import Float
 from hat_ros.config import RefinementConfig
-from hat_ros.types import Selection
+from hat_ros.types import Selection, StateReason
 
 # Keyframes in a row whose best appearance must lie in the output's basin: errors of a mask persist, but not so long.
 _KEYFRAMES = 2
@@ -46,9 +46,12 @@ class BasinConfidence:
         """Whether a keyframe's decoder clearly prefers the basin of a pose (4, 4)."""
         return selection.margin(T_cam_target[:3, :3], self._apart_deg) >= self._config.min_margin
 
-    def is_certain(self, confirmed: bool) -> bool:
-        """Whether the output's basin is certain; ``confirmed`` by the image or a second anchor, or not."""
-        if self.margin < self._config.min_margin or min(self._appearance, default=0.0) < 0.0:
-            return False
+    def verdict(self, confirmed: bool) -> StateReason:
+        """CONFIRMED if the output's basin is certain, else why not; ``confirmed`` by the image or a second anchor."""
+        if self.margin < self._config.min_margin:
+            return StateReason.AMBIGUOUS
+        if min(self._appearance, default=0.0) < 0.0:
+            return StateReason.OUTSHONE
         # Without a competing basin the margin is infinite and means nothing.
-        return confirmed or self._config.sure_margin <= self.margin < np.inf
+        is_certain = confirmed or self._config.sure_margin <= self.margin < np.inf
+        return StateReason.CONFIRMED if is_certain else StateReason.UNCONFIRMED

@@ -40,7 +40,7 @@ from hat_ros.tracking.attitude import AttitudeFilter
 from hat_ros.tracking.confidence import BasinConfidence
 from hat_ros.tracking.prior import extrapolate
 from hat_ros.tracking.uncertainty import KeyframeSpread, widened
-from hat_ros.types import Detection, Frame, Motion, Refined, RotationPrior, Selection
+from hat_ros.types import Detection, Frame, Motion, Refined, RotationPrior, Selection, StateReason
 
 # An anchor within this share of D confirms the prediction; further off it shares the basin, and confirms nothing.
 _CLOSE_SHARE = 0.5
@@ -75,6 +75,13 @@ class _TrackSupport:
     def n_anchors(self) -> int:
         """Clear anchors behind the track; none counts while no image has supported it."""
         return self.n_confirmations + self.clear_start if self.best_quality > 0.0 else 0
+
+    def verdict(self) -> StateReason:
+        """CONFIRMED unless the track itself is in doubt."""
+        if self.n_disagreements > 1:
+            return StateReason.CONTRADICTED
+        explained = self.best_quality >= _EXPLAINED_QUALITY or self.n_confirmations >= _CONFIRMATIONS
+        return StateReason.CONFIRMED if explained else StateReason.UNEXPLAINED
 
 
 class ImageFusion:
@@ -127,7 +134,9 @@ class ImageFusion:
             decided = self._confidence.decides(selection, anchor)
         fused = self._advance(frame, detection, motion, anchor, confidence, decided)
         self._confidence.update(selection, fused.T_cam_target)
-        return replace(fused, certain=fused.certain and self._confidence.is_certain(self._support.confirmed))
+        if fused.reason != StateReason.CONFIRMED:
+            return fused
+        return replace(fused, reason=self._confidence.verdict(self._support.confirmed))
 
     def spread(self, selection: Selection, T_cam_target: Float) -> Float:
         """(6, 6) spread of the hypotheses about the output over the last keyframes (:class:`KeyframeSpread`)."""
@@ -328,7 +337,6 @@ class ImageFusion:
             self._attitude.restart(T[:3, :3], refined.covariance[3:, 3:])
         support = self._support
         support.best_quality = max(support.best_quality, quality(refined))
-        explained = support.best_quality >= _EXPLAINED_QUALITY
         # An unknown overlap (NaN) is never certain.
         sure = min(refined.overlap, refined.support) >= self._refinement.certain_share
         support.confirmed = sure or support.n_confirmations > 0
@@ -337,7 +345,7 @@ class ImageFusion:
             predicted,
             measurement=T,
             covariance=widened(refined.covariance, refined.misfit_px, self._basin(T)),
-            certain=support.n_disagreements <= 1 and (explained or support.n_confirmations >= _CONFIRMATIONS),
+            reason=support.verdict(),
         )
 
     def _basin(self, T_cam_target: Float) -> Float:

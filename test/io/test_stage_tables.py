@@ -8,7 +8,7 @@ from wire_samples import BAG, ROS, STAMP, candidates, pose_rows, same_bits, thro
 
 from hat_ros.errors import WireError
 from hat_ros.io import messages, topics
-from hat_ros.types import Alignment, Candidates, Estimate, Motion, Selection, TrackState
+from hat_ros.types import Alignment, Candidates, Estimate, Motion, Selection, StateReason, TrackState
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -99,7 +99,7 @@ def test_candidate_values_that_make_no_sense_are_rejected(column, value, complai
 @pytest.mark.parametrize(
     ("column", "value", "complaint"),
     [
-        ("state", 4.0, "0 to 3"),
+        ("state", 5.0, "0 to 4"),
         ("state", 1.5, "whole number"),
         ("seq", -1.0, "whole number"),
         ("keyframe", 2.0, "0 or 1"),
@@ -120,3 +120,43 @@ def test_two_selected_rows_are_rejected():
     rows = messages.read_table(message, topics.SELECTION_COLUMNS)
     with pytest.raises(WireError, match="at most one 1"):
         messages.selection_from(rewritten(topics.SELECTION_COLUMNS, rows, 3, "selected", 1.0))
+
+
+def posed(state=TrackState.INITIALISING):
+    half = np.random.default_rng(3).normal(size=(6, 6))
+    return Estimate(STAMP, state, pose_rows(1)[0], half @ half.T, reason=StateReason.AMBIGUOUS)
+
+
+def test_status_carries_reason_and_covariance():
+    estimate = posed()
+    found = messages.status_from(through_dds(ROS.status("cam", estimate, messages.Admitted(0, 0, 0)))).estimate
+    assert (found.state, found.reason) == (TrackState.INITIALISING, StateReason.AMBIGUOUS)
+    upper = np.triu_indices(6)
+    assert same_bits(found.covariance[upper], estimate.covariance[upper])
+    assert same_bits(found.covariance, found.covariance.T)
+
+
+def status_rows():
+    message = ROS.status("cam", posed(), messages.Admitted(4, 0, 0))
+    return messages.read_table(message, topics.STATUS_COLUMNS)
+
+
+def test_a_status_of_a_newer_writer_is_read_as_far_as_it_is_known():
+    longer = ROS.table(STAMP, "cam", (*topics.STATUS_COLUMNS, "posterior"), np.append(status_rows(), 0.99)[None])
+    found = messages.status_from(through_dds(longer))
+    assert (found.seq, found.estimate.reason) == (4, StateReason.AMBIGUOUS)
+
+
+def test_a_status_of_the_first_release_is_read_without_what_came_later():
+    n = topics.N_STATUS_AT_FIRST
+    shorter = ROS.table(STAMP, "cam", topics.STATUS_COLUMNS[:n], status_rows()[:, :n])
+    estimate = messages.status_from(through_dds(shorter)).estimate
+    assert estimate.reason == StateReason.UNSTATED
+    assert np.isnan(estimate.covariance).all()
+    assert np.isfinite(estimate.pose_row).all()
+
+
+@pytest.mark.parametrize("names", [topics.STATUS_COLUMNS[:16], ("other", *topics.STATUS_COLUMNS[1:])])
+def test_a_status_without_the_first_columns_or_with_others_is_refused(names):
+    with pytest.raises(WireError, match="table columns must be state seq"):
+        messages.status_from(ROS.table(STAMP, "cam", names, status_rows()[:, : len(names)]))

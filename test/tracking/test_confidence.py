@@ -6,10 +6,11 @@ import pytest
 from hat_ros.config import RefinementConfig
 from hat_ros.geometry import lie
 from hat_ros.tracking.confidence import BasinConfidence
-from hat_ros.types import Candidates, Selection
+from hat_ros.types import Candidates, Selection, StateReason
 
 CONFIG = RefinementConfig()
 APART_DEG = 30.0
+CERTAIN = StateReason.CONFIRMED
 RIGHT, WRONG = (lie.transform(lie.so3_exp(np.array([0, 0, a])), np.array([0, 0, 5.0])) for a in (0.0, np.pi / 2))
 
 
@@ -30,26 +31,26 @@ def _after(*selections, output=RIGHT):
 
 
 def test_a_clear_lead_of_the_outputs_basin_is_needed():
-    assert _after(_selection(0.0, -CONFIG.min_margin)).is_certain(confirmed=True)
-    assert not _after(_selection(0.0, -CONFIG.min_margin + 0.1)).is_certain(confirmed=True)
+    assert _after(_selection(0.0, -CONFIG.min_margin)).verdict(confirmed=True) == CERTAIN
+    assert _after(_selection(0.0, -CONFIG.min_margin + 0.1)).verdict(confirmed=True) == StateReason.AMBIGUOUS
 
 
 def test_a_lead_of_another_basin_contradicts_the_output():
     confidence = _after(_selection(0.0, -20.0), output=WRONG)
     assert confidence.margin == -20.0
-    assert not confidence.is_certain(confirmed=True)
+    assert confidence.verdict(confirmed=True) == StateReason.AMBIGUOUS
 
 
 def test_without_confirmation_only_a_sure_lead_will_do():
-    assert _after(_selection(0.0, -CONFIG.sure_margin)).is_certain(confirmed=False)
-    assert not _after(_selection(0.0, -CONFIG.sure_margin + 0.1)).is_certain(confirmed=False)
+    assert _after(_selection(0.0, -CONFIG.sure_margin)).verdict(confirmed=False) == CERTAIN
+    assert _after(_selection(0.0, -CONFIG.sure_margin + 0.1)).verdict(confirmed=False) == StateReason.UNCONFIRMED
 
 
 def test_appearance_must_agree_with_the_decoder_at_two_keyframes_in_a_row():
     clear, against = _selection(0.0, -10.0), _selection(0.0, -10.0, appearance_right=-1.0)
-    assert not _after(against).is_certain(confirmed=True)
-    assert not _after(against, clear).is_certain(confirmed=True)
-    assert _after(against, clear, clear).is_certain(confirmed=True)
+    assert _after(against).verdict(confirmed=True) == StateReason.OUTSHONE
+    assert _after(against, clear).verdict(confirmed=True) == StateReason.OUTSHONE
+    assert _after(against, clear, clear).verdict(confirmed=True) == CERTAIN
 
 
 def test_frames_between_keyframes_change_nothing():
@@ -61,12 +62,12 @@ def test_frames_between_keyframes_change_nothing():
 def test_a_lead_without_a_competing_basin_is_none():
     alone = Selection(Candidates(lie.row_from_matrix(RIGHT[None]), np.zeros(1)), np.zeros(1), np.zeros(1), 0)
     assert _after(alone).margin == np.inf
-    assert not _after(alone).is_certain(confirmed=False)
-    assert _after(alone).is_certain(confirmed=True)
+    assert _after(alone).verdict(confirmed=False) == StateReason.UNCONFIRMED
+    assert _after(alone).verdict(confirmed=True) == CERTAIN
 
 
 @pytest.mark.parametrize("output", [None, RIGHT])
 def test_nothing_is_known_before_the_first_keyframe(output):
     confidence = _after(Selection.none(), output=output)
     assert np.isnan(confidence.margin)
-    assert not confidence.is_certain(confirmed=False)
+    assert confidence.verdict(confirmed=False) != CERTAIN

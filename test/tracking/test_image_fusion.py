@@ -9,7 +9,7 @@ from temporal_scene import HALF_TURN, make_scene, preset, rotation_error_deg
 from hat_ros.core.fusion import FusionStage
 from hat_ros.geometry import lie
 from hat_ros.tracking.image_fusion import ImageFusion, quality
-from hat_ros.types import Camera, Candidates, Frame, Motion, Refined, Selection, TrackState
+from hat_ros.types import Camera, Candidates, Frame, Motion, Refined, Selection, StateReason, TrackState
 
 COVARIANCE = np.diag([1e-6] * 6)
 
@@ -185,7 +185,7 @@ def test_weak_evidence_is_no_measurement(scene, evidence):
 
 def test_an_uncertain_start_is_tracking_only_after_a_second_anchor_agreed(scene):
     estimates = _run(_stage(scene, lambda index: {"true": (0.85, 0.85)}), scene, range(30))
-    assert [e.state for e in estimates] == [TrackState.COASTING] * 8 + [TrackState.TRACKING] * 22
+    assert [e.state for e in estimates] == [TrackState.INITIALISING] * 8 + [TrackState.TRACKING] * 22
     assert {e.gap_frames for e in estimates} == {0}
     certain = _run(_stage(scene, lambda index: {"true": (0.95, 0.95)}), scene, range(30))
     assert {e.state for e in certain} == {TrackState.TRACKING}
@@ -208,7 +208,7 @@ def test_a_mask_that_was_never_explained_well_needs_three_more_anchors(scene, ex
         return {"true": (0.86, 0.86) if index == explained_at else (0.75, 0.75)}
 
     estimates = _run(_stage(scene, evidence), scene, range(40), lead=20.0)
-    assert [e.state for e in estimates] == [TrackState.COASTING] * tracking_from + [TrackState.TRACKING] * (
+    assert [e.state for e in estimates] == [TrackState.INITIALISING] * tracking_from + [TrackState.TRACKING] * (
         40 - tracking_from
     )
 
@@ -370,3 +370,50 @@ def test_prefix_and_reset(scene):
     stage.reset()
     c = _run(stage, scene, range(60), _noisy)
     assert [e.pose_row.tobytes() for e in a] == [e.pose_row.tobytes() for e in c]
+
+
+def test_before_a_confirmation_the_state_is_initialising_and_after_it_coasting(scene):
+    def evidence(index):
+        return {} if 24 <= index < 28 else {"true": (0.85, 0.85)}
+
+    estimates = _run(_stage(scene, evidence), scene, range(40))
+    first, between, coasting = estimates[0], estimates[8], estimates[24]
+    assert (first.state, first.reason) == (TrackState.INITIALISING, StateReason.UNCONFIRMED)
+    assert (between.state, between.reason) == (TrackState.TRACKING, StateReason.CONFIRMED)
+    assert (coasting.state, coasting.reason) == (TrackState.COASTING, StateReason.NOT_MEASURED)
+    assert np.isfinite(first.pose_row).all() and np.isfinite(first.covariance).all()
+
+
+def test_what_is_found_after_a_loss_has_to_be_confirmed_anew(scene):
+    def dark(index):
+        return {} if 24 <= index < 48 else {"true": (0.85, 0.85)}
+
+    states = [
+        e.state for e in _run(_stage(scene, dark), scene, range(70), lambda i, T: T if i < 24 or i >= 48 else None)
+    ]
+    assert states[23] == TrackState.TRACKING
+    assert states[47] == TrackState.LOST
+    assert states[48:56] == [TrackState.INITIALISING] * 8
+    assert states[56:] == [TrackState.TRACKING] * 14
+
+
+def test_a_stage_that_is_told_of_an_earlier_confirmation_coasts_until_the_next(scene):
+    stage = _stage(scene, lambda index: {"true": (0.85, 0.85)})
+    stage.reset()
+    stage.resume()
+    assert [e.state for e in _run(stage, scene, range(12))] == [TrackState.COASTING] * 8 + [TrackState.TRACKING] * 4
+    stage.reset()
+    assert _run(stage, scene, range(12, 20))[-1].state == TrackState.INITIALISING
+
+
+def test_the_reason_names_what_is_missing(scene):
+    def reasons(evidence, anchor=lambda i, T: T, lead=20.0):
+        return [e.reason for e in _run(_stage(scene, evidence), scene, range(72), anchor, lead=lead)]
+
+    def contradicted(i, T):
+        turn = {40: [np.pi, 0, 0], 48: [0, 0, np.pi]}.get(i)
+        return T if turn is None else lie.transform(T[:3, :3] @ lie.so3_exp(np.array(turn, float)), T[:3, 3])
+
+    assert reasons(lambda index: {"true": (0.75, 0.75)})[1] == StateReason.UNEXPLAINED
+    assert reasons(lambda index: {"true": (0.95, 0.95)}, lead=0.1)[1] == StateReason.AMBIGUOUS
+    assert StateReason.CONTRADICTED in reasons(None, contradicted, lead=np.inf)[48:64]

@@ -25,6 +25,7 @@ STATE_COLOR = {
     TrackState.TRACKING: "#7fd6a0",
     TrackState.COASTING: "#ffd27f",
     TrackState.LOST: "#ff9c9c",
+    TrackState.INITIALISING: "#cdb4f0",
 }
 
 

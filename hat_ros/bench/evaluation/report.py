@@ -15,6 +15,7 @@ import numpy as np
 from hat_ros.array_types import UInt8
 from hat_ros.bench.evaluation import figures
 from hat_ros.io.run_log import RunLog
+from hat_ros.types import StateReason, TrackState
 
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 1080px; margin: 2em auto; padding: 0 1em; color: #1c2733; }
@@ -78,6 +79,7 @@ def write_report(
     parts = [
         f"<h1>{html.escape(title)}</h1>",
         _figure_table(metrics),
+        _states(log),
         _refusals(metrics.get("refused_reasons", ())),
         "<h2>Over time</h2>",
         image(figures.image_bytes(figures.error_figure(log)), "errors over time"),
@@ -121,6 +123,16 @@ def _figure_table(metrics: dict[str, Any]) -> str:
         if value is not None and np.isfinite(value):
             rows.append(f'<tr><td>{label}</td><td class="n">{value:{form}}</td></tr>')
     return f"<table>{''.join(rows)}</table>"
+
+
+def _states(log: RunLog) -> str:
+    """How many frames had which state, and why."""
+    pairs, counts = np.unique(np.stack([log.state, log.reason]), axis=1, return_counts=True)
+    rows = []
+    for i in np.argsort(-counts, kind="stable"):
+        state, reason = TrackState(int(pairs[0, i])), StateReason(int(pairs[1, i]))
+        rows.append(f'<tr><td class="n">{counts[i]}</td><td>{state.name}</td><td>{reason.words}</td></tr>')
+    return f"<h2>States</h2><table>{''.join(rows)}</table>" if rows else ""
 
 
 def _refusals(reasons: Sequence[dict[str, Any]]) -> str:

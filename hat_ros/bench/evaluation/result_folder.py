@@ -24,7 +24,7 @@ from hat_ros.errors import BagError, ConfigError, HatError, RunError, UsageError
 from hat_ros.io.result_bag import read_result_bag
 from hat_ros.io.results import BAG_FOLDER, CONFIG_FILE, METRICS_FILE, RUN_FILE, tum_line, write_json
 from hat_ros.io.run_log import RunLog
-from hat_ros.types import Frame, TrackState
+from hat_ros.types import Frame, StateReason, TrackState
 
 POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
 CSV_COLUMNS = (
@@ -38,6 +38,7 @@ CSV_COLUMNS = (
     "E_t_m",
     "E_q_deg",
     "E_p",
+    "reason",
 )
 
 POSES_FILE = "poses.csv"
@@ -134,6 +135,7 @@ def write_tables(path: Path, log: RunLog) -> None:
                     int(log.anchor[i]),
                     int(log.gap_frames[i]),
                     *_cells((errors.translation_m[i], np.degrees(errors.rotation_rad[i]), errors.pose[i])),
+                    StateReason(int(log.reason[i])).name,
                 )
             )
 

@@ -10,7 +10,7 @@ from hat_ros.array_types import Float
 from hat_ros.bench.evaluation import metrics
 from hat_ros.io.run_log import RunLog
 from hat_ros.target.model import Target
-from hat_ros.types import TrackState
+from hat_ros.types import StateReason, TrackState
 
 # Surface points of ADD-S; more change its third digit at most.
 ADD_S_POINTS = 1000
@@ -37,6 +37,8 @@ def score_run(log: RunLog, target: Target | None = None, played: int | None = No
     out |= metrics.coverage(log.has_output, log.has_truth, unanswered)
     out |= metrics.summarise(errors)
     out |= {f"state_{state.name.lower()}": int(np.count_nonzero(log.state == state)) for state in TrackState}
+    reasons, frames = np.unique(log.reason, return_counts=True)
+    out["reasons"] = {StateReason(int(r)).name.lower(): int(n) for r, n in zip(reasons, frames, strict=True)}
     out |= {
         "keyframes": len(keyframes),
         "resets": int(np.count_nonzero(log.reset)),

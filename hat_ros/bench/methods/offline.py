@@ -27,7 +27,7 @@ from hat_ros.stages import PoseRefiner, whole_clip_motions_of
 from hat_ros.target.model import Target
 from hat_ros.tracker import StageWrapper, Step
 from hat_ros.tracking.image_fusion import is_supported, quality
-from hat_ros.types import Camera, Detection, Estimate, Frame, Motion, TrackState
+from hat_ros.types import Camera, Detection, Estimate, Frame, Motion, StateReason, TrackState
 
 # The paper's dense refinement rejects what lies further than this from the anchors.
 _SAME_BASIN_DEG = 90.0
@@ -82,6 +82,7 @@ class Offline:
                     anchor=int(result.chosen[index]),
                     gate_weight=float(result.gate_weight[index]),
                     gap_frames=0,
+                    reason=StateReason.UNSTATED,
                 )
             )
         return estimates

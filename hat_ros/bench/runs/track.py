@@ -73,7 +73,9 @@ def track(spec: SourceSpec, out: Path, config: HatConfig, options: TrackOptions,
     credits = options.credits or min(DEFAULT_CREDITS, config.graph.credits_replay)
     pipeline = Pipeline(partial(create_method, options.mode, config, source.target), credits)
     with result_folder(folder, spec, config, mode=options.mode, start=options.start, limit=options.limit) as path:
-        measured = _run(pipeline, source, path, options, masks_given, watch)
+        frame_id, name, publish = source.frame_id, source.target.name, config.graph.publish_initialising
+        bag = ResultBagWriter(path / BAG_FOLDER, frame_id, name, publish)
+        measured = _run(pipeline, source, path, bag, options, masks_given, watch)
         complete_folder(path, source, measured, video=options.video, report=options.report)
     return folder.final_path
 
@@ -82,6 +84,7 @@ def _run(
     pipeline: Pipeline,
     source: Source,
     folder: Path,
+    bag: ResultBagWriter,
     options: TrackOptions,
     masks_given: bool,
     watch: Watcher | None,
@@ -92,7 +95,7 @@ def _run(
     total = source.count(options.start, options.limit)
     with (
         closing(LiveTables(folder, MEASURED)) as tables,
-        ResultBagWriter(folder / BAG_FOLDER, source.frame_id, source.target.name) as bag,
+        bag,
         closing(Silhouettes()) as silhouettes,
     ):
         try:
