@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import struct
+import warnings
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from hat_ros.array_types import UInt8
 from hat_ros.errors import FrameError
+from hat_ros.io import jpeg
 from hat_ros.io.value_range import ValueRange
 from hat_ros.types import MAX_IMAGE_SIDE_PX
 
@@ -29,6 +33,9 @@ def decode_compressed(data: bytes, known: ValueRange) -> tuple[UInt8, ValueRange
     width, height = _declared_size(data)
     if not (0 < height <= MAX_IMAGE_SIDE_PX and 0 < width <= MAX_IMAGE_SIDE_PX):
         raise FrameError(f"compressed image must be 1 to {MAX_IMAGE_SIDE_PX} px a side, found {width}x{height}")
+    check_pixels(data)
+    if data[:2] == jpeg.SOI and not data.endswith(jpeg.EOI):
+        data += jpeg.EOI  # some cameras leave it out: all pixels are there, but OpenCV would wait for more
     try:
         bgr = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), _FLAGS)
     except cv2.error as error:
@@ -42,14 +49,36 @@ def decode_compressed(data: bytes, known: ValueRange) -> tuple[UInt8, ValueRange
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False), known
 
 
+def check_pixels(data: bytes) -> None:
+    """Refuse damage that OpenCV notices and passes over, or does not notice: of JPEG and of compressed TIFF files.
+
+    Raises:
+        FrameError: what the file holds is not the picture that was written.
+    """
+    if data[:2] == jpeg.SOI:
+        jpeg.check_jpeg(data)
+    elif data[:4] in _TIFF_ORDER:
+        _check_tiff(data)
+
+
+def _check_tiff(data: bytes) -> None:
+    try:
+        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data)) as image:
+            image.load()
+    except Exception as error:
+        # Pillow knows fewer kinds of TIFF than OpenCV, which decides about those.
+        if isinstance(error, OSError) and "decoder error" in str(error):
+            raise FrameError("compressed image is a damaged TIFF") from None
+
+
 def _declared_size(data: bytes) -> tuple[int, int]:
     """(width, height) from the file's header."""
     try:
         if data[:8] == b"\x89PNG\r\n\x1a\n":
             width, height = struct.unpack(">II", data[16:24])
             return width, height
-        if data[:2] == b"\xff\xd8":
-            return _jpeg_size(data)
+        if data[:2] == jpeg.SOI:
+            return jpeg.jpeg_size(data)
         if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
             return _webp_size(data)
         if data[:4] in _TIFF_ORDER:
@@ -57,22 +86,6 @@ def _declared_size(data: bytes) -> tuple[int, int]:
     except (struct.error, IndexError):
         raise FrameError("compressed image ends within its header") from None
     raise FrameError("compressed image is neither JPEG, PNG, WebP nor TIFF")
-
-
-def _jpeg_size(data: bytes) -> tuple[int, int]:
-    at = 2
-    while True:
-        if data[at] != 0xFF:
-            raise FrameError("compressed image is a damaged JPEG")
-        marker = data[at + 1]
-        if marker == 0xFF:  # fill byte
-            at += 1
-            continue
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack(">HH", data[at + 5 : at + 9])
-            return width, height
-        (length,) = struct.unpack(">H", data[at + 2 : at + 4])
-        at += 2 + length
 
 
 def _webp_size(data: bytes) -> tuple[int, int]:

@@ -47,7 +47,7 @@ def test_one_sentence_from_every_reader(tmp_path, name):
     text, expected = REFUSED[name]
     path = tmp_path / "target.yaml"
     path.write_text(text)
-    begun = time.monotonic()
+    begun = time.process_time()  # of this process: the clock on the wall also tells what else the machine does
     for reader, error in (
         (read_yaml, ConfigError),
         (load_config, ConfigError),
@@ -59,7 +59,7 @@ def test_one_sentence_from_every_reader(tmp_path, name):
         assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
     with pytest.raises(ConfigError):
         load_config("default", [f"keyframes.gap_frames={text}"])
-    assert time.monotonic() - begun < 5
+    assert time.process_time() - begun < 5
 
 
 @pytest.mark.parametrize("text", ["2024-01-01", "2024-13-45", "2001-12-14t21:59:43.10-05:00"])

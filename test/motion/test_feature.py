@@ -1,6 +1,7 @@
 """The backend ``feature`` on rendered clips: laws, not figures."""
 
 import gc
+import sys
 import tracemalloc
 
 import numpy as np
@@ -227,10 +228,13 @@ def test_memory_does_not_grow(clip):
         for step, i in enumerate(to_and_fro):
             stamp_ns = (lap * len(to_and_fro) + step + 1) * FRAME_NS
             slam.update(Frame(stamp_ns, clip.frames[i].rgb, CAMERA), clip.detections[i], None)
-        gc.collect()  # else what is held depends on when the collector last ran
+        # Else what is held depends on when the collector last ran, and on how many of its 4,096 places Python's cache
+        # of looked-up attributes has filled: Numba looks the fields of a tuple up by a new text each time.
+        gc.collect()
+        sys._clear_type_cache()
         held.append(tracemalloc.get_traced_memory()[0])
     tracemalloc.stop()
-    assert max(held[8:]) < max(held[2:8]) + 64_000
+    assert max(held[8:]) < max(held[2:8]) + 2_000  # of which ``held`` itself takes 500; a frame's track takes more
 
 
 def test_bulge_is_highest_in_the_middle_and_low_at_the_edge():

@@ -18,6 +18,7 @@ from hat_ros.bench.datasets.calibration_file import CameraFile, read_camera_file
 from hat_ros.bench.datasets.image_files import FIRST_STAMP_NS, image_size
 from hat_ros.errors import DatasetError, FrameError, UsageError
 from hat_ros.io.bag_writer import BagWriter
+from hat_ros.io.compressed import check_pixels
 from hat_ros.target.loading import find_model, load_target
 from hat_ros.types import Camera
 
@@ -151,15 +152,17 @@ class _Folder:
     def frames(self) -> Iterator[tuple[int, bytes | UInt8, tuple[int, int]]]:
         """Stamp, bytes or RGB pixels, and (width, height) of each image."""
         for index, path in enumerate(self._paths):
-            pixels = cv2.imdecode(
-                np.fromfile(path, dtype=np.uint8),
-                cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION,
-            )
+            data = path.read_bytes()
+            try:
+                check_pixels(data)
+            except FrameError as error:
+                raise DatasetError(f"{path}: {error}; remove or replace it") from None
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), _FLAGS) if data else None
             if pixels is None:
                 raise DatasetError(f"{path}: not an image that can be decoded; remove or replace it")
             size = (pixels.shape[1], pixels.shape[0])
             if path.suffix.lower() in _AS_IS:
-                yield FIRST_STAMP_NS + round(index * self._step_ns), path.read_bytes(), size
+                yield FIRST_STAMP_NS + round(index * self._step_ns), data, size
                 continue
             if pixels.dtype != np.uint8:
                 raise DatasetError(f"{path}: {pixels.dtype} values per channel; save it as a PNG")

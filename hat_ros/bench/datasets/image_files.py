@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from hat_ros.array_types import Float, Float32, UInt8
 from hat_ros.errors import DatasetError, FrameError
 from hat_ros.geometry import lie
+from hat_ros.io.compressed import check_pixels
 from hat_ros.io.value_range import ValueRange
 from hat_ros.types import Camera, Frame
 
@@ -159,6 +160,10 @@ def _decoded(path: Path, flags: int) -> NDArray[np.generic]:
         data = np.fromfile(path, dtype=np.uint8)
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read ({error.strerror})") from None
+    try:
+        check_pixels(data.tobytes())
+    except FrameError as error:
+        raise DatasetError(f"{path}: {error}; copy the data set again") from None
     # Bits per channel and EXIF rotation as stored: labels refer to the stored pixels.
     image = cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
     if image is None:
