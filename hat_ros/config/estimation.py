@@ -74,8 +74,12 @@ class AlignmentConfig:
     rejection_factor: float = option(
         3.0, "outliers lie beyond this factor of the inliers' median residual", level="paper", low=1
     )
-    first_rejection_rounds: int = option(3, "outlier rounds of the first fit", level="paper", low=0)
-    refit_rejection_rounds: int = option(1, "outlier rounds of a refit", level="paper", low=0)
+    first_rejection_rounds: int = option(
+        3, "rejections of outliers in the first fit, a fit after each; 2: as published", level="paper", low=0
+    )
+    refit_rejection_rounds: int = option(
+        1, "rejections of outliers in a refit, a fit after each; 0: one plain fit, as published", level="paper", low=0
+    )
     reset_anchors: int = option(
         4, "coherent disagreeing anchors in a row that drop the alignment", level="paper", low=1
     )
@@ -119,7 +123,11 @@ class FusionConfig:
         choices=("hold", "rotate"),
     )
     coast_limit_frames: int = option(
-        60, "time without a measurement after which the target is LOST", level="basic", unit="frames", low=1
+        60,
+        "time without a measurement after which the target is LOST; 0: never, the last pose is held, as published",
+        level="basic",
+        unit="frames",
+        low=0,
     )
 
 

@@ -8,7 +8,8 @@ The fit separates. With ``u = (R^A)^T t^A`` the two halves of the residual of on
 so the minimum of eq. (alignmentfit) is the mean of the rotations ``(R^S R_M)^T`` beside the straight-line regression
 of c on t^S. It is the minimum that a Levenberg-Marquardt search over log-scale, rotation vector and translation
 approaches (a test compares them), at a cost that allows thousands of observations. No nonlinear solver is
-needed.
+needed, but for one thing: the rotations of a first fit may contradict each other, their mean has several local minima
+then, and the search over all seven parameters says which one is meant.
 """
 
 from __future__ import annotations
@@ -27,6 +28,10 @@ from hat_ros.types import Alignment
 _MIN_SCALE = 1e-9
 # SLAM positions that spread less than this share of their distance from the origin determine no scale.
 _MIN_RELATIVE_SPREAD = 1e-9
+# Rotations within a quarter turn of their mean have one mean only (Karcher, Comm. Pure Appl. Math. 30, 1977).
+_ONE_MEAN_RAD = np.pi / 2
+# Least median residual in metres that outliers are told by, as in the authors' reference: exact data have none.
+_MIN_MEDIAN_M = 1e-6
 
 
 @dataclass(frozen=True)
@@ -43,7 +48,7 @@ class SlamAlignment:
 
     Attributes:
         current: the similarity in force, None before the first fit.
-        n_observations: joint observations since the last :meth:`reset`.
+        n_observations: joint observations since the last :meth:`reset`, without those that do not count.
     """
 
     def __init__(self, config: AlignmentConfig) -> None:
@@ -56,11 +61,16 @@ class SlamAlignment:
         self.current: Alignment | None = None
         self.n_observations = 0
         self._history = JointHistory(self._config.max_observations)
+        self._newest = _Fit(1.0, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
         self._frames_since_fit = 0
 
-    def observe(self, T_cam_target: Float, T_slam_cam: Float) -> None:
-        """Add an anchor and the SLAM pose of the same frame, (4, 4) each."""
-        self.n_observations += 1
+    def observe(self, T_cam_target: Float, T_slam_cam: Float, counts: bool = True) -> None:
+        """Add an anchor and the SLAM pose of the same frame, (4, 4) each.
+
+        Args:
+            counts: whether it brings the first fit, and fusion, nearer; it is fitted to in any case.
+        """
+        self.n_observations += counts
         self._history.append(T_cam_target, T_slam_cam)
 
     def update(self, epoch: int) -> None:
@@ -72,31 +82,32 @@ class SlamAlignment:
         if self.current is None:
             if self.n_observations < self._config.min_observations:
                 return
-            start = umeyama(self._history.slam_position, self._history.target_position)
-            rounds = self._config.first_rejection_rounds
+            fit, rounds = _provisional(self._history), self._config.first_rejection_rounds
         elif self._frames_since_fit >= self._config.refit_interval_frames:
-            start = (self.current.scale, self.current.quat_xyzw)
-            rounds = self._config.refit_rejection_rounds
+            fit, rounds = self._newest, self._config.refit_rejection_rounds
         else:
             return
         self._frames_since_fit = 0
         self._n_fits += 1
-        self.current = self._robust_fit(*start, rounds, epoch)
+        self.current = self._robust_fit(fit, rounds, epoch)
 
-    def _robust_fit(self, scale: float, quat_xyzw: Float, rounds: int, epoch: int) -> Alignment:
-        """Fit to all observations, then again to those with small residuals, up to ``rounds`` times."""
-        history, lever = self._history, self._config.lever_m_per_rad
+    def _robust_fit(self, fit: _Fit, rounds: int, epoch: int) -> Alignment:
+        """Fit to all observations, then up to ``rounds`` times again to those with small residuals.
+
+        Every call begins with all observations: what an earlier one rejected is forgotten.
+        """
+        history, lever, first = self._history, self._config.lever_m_per_rad, self.current is None
         inliers = np.ones(len(history), dtype=bool)
-        fit = _fit(history, inliers, scale, quat_xyzw)
+        fit = _fit(history, inliers, fit, lever, first)
         norms = _residual_norms(history, fit, lever)
         for _ in range(rounds):
-            keep = norms < self._config.rejection_factor * np.median(norms[inliers])
+            keep = norms < self._config.rejection_factor * max(float(np.median(norms[inliers])), _MIN_MEDIAN_M)
             if np.count_nonzero(keep) < 3 or np.count_nonzero(keep) == np.count_nonzero(inliers):
                 break
             inliers = keep
-            fit = _fit(history, inliers, fit.scale, fit.quat_xyzw)
+            fit = _fit(history, inliers, fit, lever, first)
             norms = _residual_norms(history, fit, lever)
-        history.inliers = inliers
+        history.inliers, self._newest = inliers, fit
         return Alignment(
             version=self._n_fits,
             scale=fit.scale,
@@ -108,14 +119,50 @@ class SlamAlignment:
         )
 
 
-def _fit(history: JointHistory, rows: Bool, scale: float, quat_xyzw: Float) -> _Fit:
+def _provisional(history: JointHistory) -> _Fit:
+    """Umeyama's similarity of the camera's positions, from which a first fit starts."""
+    scale, quat_xyzw = umeyama(history.slam_position, history.target_position)
+    R = lie.matrix_from_quat(quat_xyzw)
+    offset_m = R.T @ history.target_position.mean(axis=0) - scale * history.slam_position.mean(axis=0)
+    return _Fit(scale, quat_xyzw, offset_m)
+
+
+def _fit(history: JointHistory, rows: Bool, start: _Fit, lever_m_per_rad: float, first: bool) -> _Fit:
     """Minimum of eq. (alignmentfit) over the chosen rows and the fold; the start scale stays if nothing tells it."""
     moments = history.moments(rows)
     extent_sq = moments.count * float(moments.mean_slam @ moments.mean_slam) + moments.spread
+    scale = start.scale
     if moments.spread > extent_sq * _MIN_RELATIVE_SPREAD**2:
         scale = max(moments.covariation / moments.spread, _MIN_SCALE)
     offset_m = moments.mean_camera - scale * moments.mean_slam
-    return _Fit(scale, history.rotation_mean(rows, quat_xyzw), offset_m)
+    quat_xyzw = history.rotation_mean(rows, start.quat_xyzw)
+    if first and _rotation_angles(history, quat_xyzw)[rows].max() > _ONE_MEAN_RAD:
+        quat_xyzw = history.rotation_mean(rows, _searched_rotation(history, rows, start, lever_m_per_rad))
+    return _Fit(scale, quat_xyzw, offset_m)
+
+
+def _rotation_angles(history: JointHistory, quat_xyzw: Float) -> Float:
+    """Angle in radians of every stored reading of R^A from a rotation: (n,)."""
+    return np.linalg.norm(relative_rotvecs(history.relative_quat, quat_xyzw), axis=1)
+
+
+def _searched_rotation(history: JointHistory, rows: Bool, start: _Fit, lever_m_per_rad: float) -> Float:
+    """Rotation (4,) at which the published Levenberg-Marquardt search ends: log-scale, rotation vector, translation."""
+    from scipy.optimize import least_squares  # a tenth of a second to import, for a rare case
+
+    relative, slam, camera = history.relative_quat[rows], history.slam_position[rows], history.camera_position[rows]
+
+    def residuals(parameters: Float) -> Float:
+        R = lie.so3_exp(parameters[1:4])
+        turn = lever_m_per_rad * relative_rotvecs(relative, lie.quat_from_matrix(R))
+        shift = np.exp(parameters[0]) * slam + R.T @ parameters[4:] - camera
+        return np.concatenate([turn, shift], axis=1).ravel()
+
+    R = lie.matrix_from_quat(start.quat_xyzw)
+    found = least_squares(
+        residuals, np.concatenate([[np.log(start.scale)], lie.so3_log(R), R @ start.offset_m]), method="lm"
+    )
+    return lie.quat_from_matrix(lie.so3_exp(found.x[1:4]))
 
 
 def _residual_norms(history: JointHistory, fit: _Fit, lever_m_per_rad: float) -> Float:
@@ -128,7 +175,7 @@ def _residual_norms(history: JointHistory, fit: _Fit, lever_m_per_rad: float) ->
 def umeyama(source: Float, destination: Float) -> tuple[float, Float]:
     """Scale and rotation of the similarity that maps source points onto destination points in least squares.
 
-    Umeyama, IEEE TPAMI 13 (1991), eqs. (39)-(43). The translation is not needed by its callers.
+    Umeyama, IEEE TPAMI 13 (1991), eqs. (39)-(43); the translation follows from the means.
 
     Args:
         source: (n, 3) points.

@@ -64,7 +64,7 @@ class FusionStage:
     States: UNINITIALISED before the first pose. TRACKING while the method is certain of the pose that it solved for.
     While the pose is only held, predicted, ambiguous, or in doubt: COASTING if it has been TRACKING since the target
     was found, else INITIALISING. LOST once ``coast_limit_frames`` went by without a measurement (an anchor, or a
-    supported refinement); no pose then, and what is found afterwards has to be confirmed anew.
+    supported refinement), unless that is 0; no pose then, and what is found afterwards has to be confirmed anew.
     """
 
     def __init__(self, config: HatConfig, method: FusionMethod) -> None:
@@ -128,7 +128,8 @@ class FusionStage:
         if T_cam_target is None and not self._lost:
             return TrackState.UNINITIALISED, StateReason.NOT_FOUND, None
         self._gap_frames = 0 if fused.measurement is not None else self._gap_frames + 1
-        self._lost = self._gap_frames > (0 if self._lost else self._config.fusion.coast_limit_frames)
+        limit_frames = self._config.fusion.coast_limit_frames
+        self._lost = limit_frames > 0 and self._gap_frames > (0 if self._lost else limit_frames)
         if self._lost:
             self._method.lose()
             self._last_pose = None

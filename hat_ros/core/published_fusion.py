@@ -114,8 +114,9 @@ class PublishedFusion:
             self._dissent.clear()
 
     def _restart_from(self, anchor: Float, motion: Motion) -> None:
+        """The anchor that triggers a reset is fitted to, but the counts start at zero after it (authors' reference)."""
         self.alignment.reset()
-        self.alignment.observe(anchor, motion.T_slam_cam)
+        self.alignment.observe(anchor, motion.T_slam_cam, counts=False)
         self._dissent.clear()
 
     def _fuse(self, motion: Motion, anchor: Float | None, gate_weight: float, confidence: float) -> Fused:

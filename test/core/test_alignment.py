@@ -136,10 +136,37 @@ def test_reset_drops_the_fit_and_versions_go_on():
     assert (alignment.current.version, alignment.current.epoch, alignment.current.n_anchors) == (2, 2, 3)
 
 
+def test_a_plain_refit_takes_all_observations_and_a_robust_one_leaves_outliers_out():
+    observations, _ = _planted(5, 40, noise_deg=1.0, outliers=5)
+    counts = []
+    for rejections in (0, 1):
+        alignment = SlamAlignment(AlignmentConfig(refit_rejection_rounds=rejections))
+        for anchor, T_slam_cam in observations:
+            alignment.observe(anchor, T_slam_cam)
+            alignment.update(epoch=0)
+        # The last fit saw 33 of them: three frames' worth, then one fit every ten.
+        counts.append(alignment.current.n_anchors)
+    assert counts == [33, 28]
+
+
+def test_an_observation_may_be_fitted_to_without_counting():
+    observations, _ = _planted(0, 4)
+    alignment = SlamAlignment(AlignmentConfig())
+    for i, (anchor, T_slam_cam) in enumerate(observations):
+        alignment.observe(anchor, T_slam_cam, counts=i > 0)
+        alignment.update(epoch=0)
+        assert (alignment.current is None) == (i < 3)
+    assert alignment.n_observations == 3
+    assert alignment.current.n_anchors == 4
+
+
 class TestBoundedHistory:
-    def test_folding_stays_within_tolerance_of_the_full_refit(self):
+    @pytest.mark.parametrize("rejections", [0, 1], ids=["as published", "robust"])
+    def test_folding_stays_within_tolerance_of_the_full_refit(self, rejections):
         observations, _ = _planted(3, 900, noise_deg=3.0, noise_m=0.05, outliers=40)
-        full, bounded = (SlamAlignment(AlignmentConfig(max_observations=m)) for m in (10_000, 64))
+        full, bounded = (
+            SlamAlignment(AlignmentConfig(max_observations=m, refit_rejection_rounds=rejections)) for m in (10_000, 64)
+        )
         for anchor, T_slam_cam in observations:
             for alignment in (full, bounded):
                 alignment.observe(anchor, T_slam_cam)

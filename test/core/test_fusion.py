@@ -67,6 +67,15 @@ def test_motion_without_anchors_is_lost_in_the_end():
     assert {e.state for e in drifting[30:]} == {TrackState.LOST}
 
 
+def test_without_a_limit_the_last_pose_is_held_and_never_lost():
+    scene = make_scene(120)
+    stage = _stage(preset(fusion={"coast_limit_frames": 0}))
+    last = _run(stage, scene, range(21))[-1]
+    blind = _run(stage, scene, range(21, 120), anchored=False, moving=False)
+    assert {e.state for e in blind} == {TrackState.COASTING}
+    np.testing.assert_array_equal(blind[-1].pose_row, last.pose_row)
+
+
 def test_the_estimate_reports_what_happened():
     scene = make_scene(40)
     estimates = _run(_stage(preset()), scene, range(40))

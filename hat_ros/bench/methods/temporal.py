@@ -1,8 +1,7 @@
 """Stages 3 and 4 alone over recorded observations: a temporal setting costs a second instead of a run.
 
-The stages are the very objects of the tracker, without refinement (there are no images). A pose is given for every
-frame after the first anchor, however long ago it was: being LOST is a matter for those who act on poses, not for
-comparing them.
+The stages are the very objects of the tracker, without refinement (there are no images). So a pose is held for as long
+as it is in a run with the same configuration: without a limit in the paper's presets.
 
 Two forms of observations, two forms of answers: :class:`~hat_ros.bench.observations.Observations` (``hat temporal``)
 gives a :class:`TemporalResult`; the :class:`~hat_ros.io.run_log.RunLog` of ``--mode observe`` (``hat ablate``) gives a
@@ -13,7 +12,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -46,7 +45,7 @@ class TemporalResult:
     """The causal answer for N frames.
 
     Attributes:
-        T_cam_target: (N, 4, 4) output, NaN before the first; the last valid pose where ``held``.
+        T_cam_target: (N, 4, 4) output, NaN before the first and while LOST; the last valid pose where ``held``.
         chosen: (N,) int, index of the anchor among the recorded candidates, -1 where there is none.
         accepted: (N,) bool, the decoder's own proposal became the anchor: warm-up over, running gate open.
         resets: (M,) int, frames at which the alignment was dropped.
@@ -151,8 +150,7 @@ def keyframes_of(log: RunLog, config: HatConfig) -> list[Candidates]:
 def _causal(
     stamps: Sequence[int], observed: Iterable[tuple[Candidates, Motion]], config: HatConfig, selector: Selector
 ) -> Iterator[tuple[Selection, Estimate]]:
-    """Stages 3 and 4 frame by frame; never LOST."""
-    config = replace(config, fusion=replace(config.fusion, coast_limit_frames=max(1, len(stamps))))
+    """Stages 3 and 4 frame by frame."""
     fusion = FusionStage(config, PublishedFusion(config))
     for stamp_ns, (candidates, motion) in zip(stamps, observed, strict=True):
         selection = selector.update(candidates, motion)

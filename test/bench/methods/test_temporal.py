@@ -200,10 +200,10 @@ class TestReset:
         np.testing.assert_allclose(error[52::4], 180.0, atol=1e-3)
         assert (error[13:40] < 1e-6).all()
 
-    def test_after_a_reset_the_warm_up_starts_over_with_the_triggering_frame(self):
+    def test_after_a_reset_the_warm_up_starts_over_and_the_triggering_anchor_does_not_count(self):
         _, observations = self._flipped_from(40)
         result = run_temporal(observations, preset())
-        assert np.flatnonzero(result.held[50:]).tolist() == [3, 4, 5, 7, 8, 9, 11, 12, 13]
+        assert np.flatnonzero(result.held[50:]).tolist() == [3, 4, 5, 7, 8, 9, 11, 12, 13, 15, 16, 17]
 
     def test_three_are_not_enough_and_an_agreeing_one_clears_the_count(self):
         T, o = _perfect(100, k=1)
@@ -283,12 +283,12 @@ def test_replay_is_hat_temporal_on_the_same_observations():
     np.testing.assert_array_equal(replayed.anchor, expected.chosen)
 
 
-def test_every_frame_after_the_first_anchor_has_a_pose():
-    log = observations()
-    sparse = replace(
-        CONFIG, keyframes=replace(CONFIG.keyframes, gap_frames=70), fusion=replace(CONFIG.fusion, coast_limit_frames=1)
-    )
+def test_a_pose_is_held_for_as_long_as_the_configuration_says():
+    log = observations(motion=False)
+    sparse = replace(CONFIG, keyframes=replace(CONFIG.keyframes, gap_frames=70))
     assert replay_temporal(log, sparse).has_output.all()
+    limited = replace(sparse, fusion=replace(sparse.fusion, coast_limit_frames=60))
+    assert np.flatnonzero(~replay_temporal(log, limited).has_output).tolist() == list(range(61, 70))
 
 
 def test_offline_is_no_worse_than_causal_on_the_same_observations():
