@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 PYTEST := ROS_PYTHON_CHECK_FIELDS=1 $(BIN)/python -m pytest
 
-.PHONY: help demo test test-accuracy test-slow test-gpu mutation fuzz lint types count docs wheel-check wheel-oldest \
+.PHONY: help demo test test-accuracy test-slow test-live test-gpu mutation fuzz lint types count docs wheel-check wheel-oldest \
   wheel-newest colcon-check install install-nets install-test clean
 .DELETE_ON_ERROR:
 
@@ -23,6 +23,9 @@ test-accuracy: install-test  ## the accuracy gate alone: the default preset on s
 
 test-slow: install-test  ## tests that take minutes each
 	$(PYTEST) -m "slow and not gpu"
+
+test-live: install-test  ## every scenario of the live graph: kills, lifecycle orders, cameras; minutes
+	$(PYTEST) -m live
 
 test-gpu: install-test  ## tests that need an accelerator
 	$(PYTEST) -m gpu

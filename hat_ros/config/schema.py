@@ -74,9 +74,20 @@ class GraphConfig:
         "and in every record in any case",
         level="basic",
     )
+    credits_live: int = option(
+        1, "credits live: 2 frames in flight give more poses per second, each later", unit="frames", low=1, high=2
+    )
     stage_timeout_s: float = option(
         30.0,
         "a stage that takes longer over a frame is an error; networks on a CPU need minutes",
+        level="basic",
+        unit="s",
+        low=0.1,
+    )
+    live_timeout_s: float = option(
+        1.0,
+        "live: a frame without an answer for so long is given up and the next one enters; after each in a row twice as "
+        "long, at most stage_timeout_s",
         level="basic",
         unit="s",
         low=0.1,
@@ -111,8 +122,10 @@ class HatConfig:
     graph: GraphConfig = field(default_factory=GraphConfig)
 
     def __post_init__(self) -> None:
-        if self.prior.enabled and self.prior.delay_frames < self.graph.credits_replay:
-            raise ConfigError(
-                f"prior.delay_frames is {self.prior.delay_frames} but must be at least graph.credits_replay "
-                f"({self.graph.credits_replay}): a prior may never depend on a frame still in flight"
-            )
+        for name in ("credits_replay", "credits_live"):
+            credits = getattr(self.graph, name)
+            if self.prior.enabled and self.prior.delay_frames < credits:
+                raise ConfigError(
+                    f"prior.delay_frames is {self.prior.delay_frames} but must be at least graph.{name} "
+                    f"({credits}): a prior may never depend on a frame still in flight"
+                )

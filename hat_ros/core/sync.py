@@ -173,6 +173,11 @@ class Admission:
         del self._in_flight[stamp_ns]
         return True
 
+    def forget_stamps(self) -> None:
+        """Let any stamp in next, one that is older than the last one, too; only where stamps may begin anew."""
+        if self._restarts:
+            self.last_stamp_ns = 0
+
     def give_up(self) -> tuple[int, ...]:
         """Forget all frames in flight and return their stamps: a stage did not answer."""
         lost = self.in_flight

@@ -14,19 +14,22 @@ class FramesInFlight:
     """Admits frames by credit and notices one that is not answered in time.
 
     Args:
-        config: its time limits and, in a replay, the credits W.
-        live: one frame in flight.
+        config: its time limits and credits.
+        live: a frame that is late is given up soon, and the next one enters.
         restarts: stamps that step back begin anew, see :class:`~hat_ros.core.sync.Admission`.
 
     Attributes:
         admission: stamps and credits.
+        given_up: frames that were given up so far.
     """
 
     def __init__(self, config: GraphConfig, live: bool, restarts: bool = False) -> None:
-        self._config = config
+        self._config, self._live = config, live
         self._entered_s: dict[int, float] = {}
         self._is_warm = False
-        self.admission = Admission(1 if live else config.credits_replay, restarts)
+        self._in_a_row = 0
+        self.admission = Admission(config.credits_live if live else config.credits_replay, restarts)
+        self.given_up = 0
 
     @property
     def admitted(self) -> int:
@@ -44,16 +47,23 @@ class FramesInFlight:
         if not self.admission.answered(stamp_ns):
             return False
         del self._entered_s[stamp_ns]
-        self._is_warm = True
+        self._is_warm, self._in_a_row = True, 0
         return True
+
+    def give_up(self) -> int:
+        """Give up all frames under way; how many there were."""
+        lost = len(self.admission.give_up())
+        self._entered_s.clear()
+        self.given_up += lost
+        return lost
 
     def overdue(self) -> StageTimeoutError | None:
         """What is wrong when the oldest frame has waited too long; then all frames under way are given up."""
         oldest = next(iter(self._entered_s), None)
-        limit_s, option = answer_limit(self._config, first=not self._is_warm)
+        limit_s, option = answer_limit(self._config, not self._is_warm, self._in_a_row if self._live else None)
         if oldest is None or time.monotonic() - self._entered_s[oldest] <= limit_s:
             return None
-        self.admission.give_up()
-        self._entered_s.clear()
+        self.give_up()
+        self._in_a_row += 1
         late = f"no status for frame {oldest} within {limit_s:g} s (raise {option} if it is only slow)"
         return StageTimeoutError(f"{late}: {HANGS}")

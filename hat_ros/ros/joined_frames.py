@@ -59,9 +59,16 @@ class JoinedFrames:
         joined: topics of which every frame has one message, beside the admission.
         prior: configuration of priors, None for a stage that uses none.
         reset: called when a frame opens a new epoch: forget the target's state.
+        live: a frame of which a message was lost is passed over, and its estimate is not waited for. The entrance lets
+            the next one in only when it has given that frame up.
+
+    Attributes:
+        lost: frames that were passed over.
     """
 
-    def __init__(self, joined: Sequence[str], prior: PriorConfig | None, reset: Callable[[], None]) -> None:
+    def __init__(
+        self, joined: Sequence[str], prior: PriorConfig | None, reset: Callable[[], None], live: bool = False
+    ) -> None:
         self._join = ExactJoin((topics.ADMISSION, *joined))
         self._priors = None if prior is None else PriorBuffer(prior)
         self._reset = reset
@@ -70,6 +77,8 @@ class JoinedFrames:
         self._epoch: int | None = None  # of the last frame taken; None: the next one opens an epoch
         self._is_fresh = True
         self._newest_ns = 0
+        self._live = live
+        self.lost = 0
 
     def __len__(self) -> int:
         """Frames of which something is waiting."""
@@ -113,7 +122,7 @@ class JoinedFrames:
         """The next frame, None while something that it needs has not arrived.
 
         Raises:
-            RunError: a message was lost.
+            RunError: a message was lost, in a replay.
             WireError: the admission is malformed.
         """
         head = self._join.peek()
@@ -126,14 +135,25 @@ class JoinedFrames:
             self._join.drop_before(stamp_ns)  # given up in the old epoch, never to be completed
         if self._priors is not None:
             self._priors.admit(stamp_ns)
-            if not self._priors.ready(stamp_ns):
+            if not self._live and not self._priors.ready(stamp_ns):
                 return None
         camera = self._camera_at(stamp_ns)
         if camera is None and self._with_image:
             return None
+        if self._live:
+            self._pass_over(stamp_ns)
         self._join.take()
         prior = None if self._priors is None else self._priors.before(stamp_ns)
         return JoinedFrame(stamp_ns, admitted, items, camera, prior)
+
+    def _pass_over(self, stamp_ns: int) -> None:
+        """Frames before this one that are not complete, or were never answered, have been given up."""
+        missing = self._join.missing()
+        if missing is not None and missing[0] < stamp_ns:
+            self.lost += 1
+            self._join.drop_before(stamp_ns)
+        if self._priors is not None:
+            self._priors.drop_unanswered(stamp_ns)
 
     def _enter(self, epoch: int) -> None:
         if not self._is_fresh:

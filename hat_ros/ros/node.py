@@ -27,6 +27,8 @@ from hat_ros.ros.params import declare_parameters
 from hat_ros.ros.session import Session
 
 _ACK_TIMEOUT_S = 10.0
+# A fault of every frame would fill the console.
+_LOG_PERIOD_S = 1.0
 
 SessionT_co = TypeVar("SessionT_co", bound=Session, covariant=True)
 
@@ -62,7 +64,7 @@ class HatNode(LifecycleNode, ABC, Generic[SessionT_co]):
         self.failure: HatError | None = None
         self._session: SessionT_co | None = None
         self._announced = False
-        self.endpoints = Endpoints(self, self.settings.live, self.settings.recorded, self.guarded)
+        self.endpoints = Endpoints(self, self.settings.live, self.settings.recorded, self.guarded, lambda: self.active)
         self.diagnostics = Diagnostics(self, self.wire, self.values)
         self._ready = self.create_publisher(message_class(topics.TYPES[topics.READY]), topics.READY, qos.LATCH)
         self.create_timer(1.0, self._every_second, clock=STEADY)
@@ -103,11 +105,13 @@ class HatNode(LifecycleNode, ABC, Generic[SessionT_co]):
             self.fail(RunError(f"{type(error).__name__}: {error}"))
 
     def fail(self, error: HatError) -> None:
-        """Report what went wrong; a replay ends, a live graph goes on (its next epoch starts without this frame)."""
-        self.get_logger().error(str(error))
+        """Report what went wrong; a replay ends, a live graph goes on without the frame, in a new epoch."""
+        self.get_logger().error(str(error), throttle_duration_sec=_LOG_PERIOD_S)
         self.diagnostics.report(ERROR, str(error))
         if not (self.settings.live and self.active and self.GOES_ON_LIVE):
             self.failure = error
+        elif self._announced:
+            self._say_ready()
 
     # ------------------------------------------------------------ timers, end of the stream
 
@@ -118,8 +122,12 @@ class HatNode(LifecycleNode, ABC, Generic[SessionT_co]):
         if not unmatched:
             self._announced = True
             self._announcer.cancel()
-            self._ready.publish(self.wire.header(time.time_ns(), self.NAME))
+            self._say_ready()
         self.diagnostics.report(OK, "ready" if not unmatched else f"waiting for {', '.join(unmatched)}")
+
+    def _say_ready(self, ready: bool = True) -> None:
+        """Tell the others; said again, it means that what was under way here is lost. Without a stamp: not ready."""
+        self._ready.publish(self.wire.header(time.time_ns() if ready else 0, self.NAME))
 
     def _every_second(self) -> None:
         supervisor = self.settings.supervisor_pid
@@ -161,11 +169,12 @@ class HatNode(LifecycleNode, ABC, Generic[SessionT_co]):
         self.active = True
         self._announcer.reset()
         self.diagnostics.report(OK, "waiting for the other nodes")
+        self.endpoints.deliver_held()
         return super().on_activate(state)
 
     def on_deactivate(self, state: Any) -> TransitionCallbackReturn:
         """Drop messages from now on."""
-        self.active = self._announced = False
+        self._withdraw()
         self.diagnostics.report(OK, "inactive")
         return super().on_deactivate(state)
 
@@ -176,8 +185,14 @@ class HatNode(LifecycleNode, ABC, Generic[SessionT_co]):
 
     def on_shutdown(self, state: Any) -> TransitionCallbackReturn:
         """Like cleanup; the node cannot be configured again."""
-        self.active = False
+        self._withdraw()
         return self._transition(self._cleanup)
+
+    def _withdraw(self) -> None:
+        """Take no message any more, and say so."""
+        if self._announced:
+            self._say_ready(False)
+        self.active = self._announced = False
 
     def _cleanup(self) -> None:
         self.endpoints.clear()
@@ -186,7 +201,7 @@ class HatNode(LifecycleNode, ABC, Generic[SessionT_co]):
 
     def release(self) -> None:
         """Close the session, also outside the lifecycle (an interrupted process); harmless when there is none."""
-        self.active = False
+        self._withdraw()
         session, self._session = self._session, None
         if session is not None:
             session.close()

@@ -70,7 +70,10 @@ class PlayerSession(Session):
         return self.playback.summary()
 
     def _on_ready(self, message: Any) -> None:
-        self._ready_nodes.add(message.frame_id)
+        if message.stamp.sec > 0:
+            self._ready_nodes.add(message.frame_id)
+        else:
+            self._ready_nodes.discard(message.frame_id)
 
     def _on_status(self, message: Any) -> None:
         self.playback.note_status(messages.status_from(message))

@@ -37,6 +37,7 @@ class SegmentationSession(Session):
         self._stage = SegmentationStage(config, node.settings.load_target())
         self._priors = PriorBuffer(config.prior)
         self._entrance = Entrance(live, annotated, config.camera.image_depth)
+        self._config = config.graph
         self._rectified = config.camera.rectified
         self._image_topic = node.resolve_topic_name(topics.IMAGE)
         # A record tells frames by their stamps: there none may come twice.
@@ -66,8 +67,12 @@ class SegmentationSession(Session):
         subscribe(topics.READY, self._on_ready, profile=qos.LATCH_READER, required=False)
 
     def every_second(self) -> None:
-        """Look again for a second camera."""
+        """Look again for a second camera, and for stages that are gone."""
         self._expect_one_camera()
+        gone = self._node.endpoints.gone(topics.ADMISSION) if self._is_open else []
+        if gone:
+            self._ready_nodes.difference_update(gone)
+            self._lose(f"{', '.join(gone)}: gone")
 
     def _expect_one_camera(self) -> None:
         """Notice a second camera on the same topic: the frames of both would be one sequence.
@@ -132,10 +137,36 @@ class SegmentationSession(Session):
         self._pump()
 
     def _on_ready(self, message: Any) -> None:
-        self._ready_nodes.add(message.frame_id)
+        name, is_ready = message.frame_id, message.stamp.sec > 0  # of the wall clock; 0: not any more
+        if name in self._ready_nodes & _STAGES and self._is_open:
+            self._lose(f"{name}: {'started again' if is_ready else 'stopped'}")
+        (self._ready_nodes.add if is_ready else self._ready_nodes.discard)(name)
         self._pump()
 
+    def _lose(self, what: str) -> None:
+        """A stage has lost its state and what was under way there: give that up at once, go on in a new epoch.
+
+        Raises:
+            RunError: in a replay, unless all has been answered.
+        """
+        lost = self._in_flight.give_up()
+        sentence = f"{what}; {lost} frames were under way, a new epoch begins when all stages are ready"
+        if lost and not self._node.settings.live:
+            raise RunError(sentence)
+        self._is_open = False
+        self._new_epoch(resumed=self._last_state.is_confirmed)
+        self._warn(sentence)
+
+    def _warn(self, sentence: str) -> None:
+        self._node.get_logger().warning(sentence)
+        self._diagnostics.report(WARN, sentence)
+
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Forget the target; live, also what is under way and the newest stamp."""
+        if self._node.settings.live:
+            self._in_flight.give_up()
+            self._in_flight.admission.forget_stamps()
+            self._camera_sent = False  # in force from the next stamp on, whatever that is
         self._new_epoch()
         response.success, response.message = True, f"epoch {self._epoch} begins with the next frame"
         return response
@@ -162,7 +193,9 @@ class SegmentationSession(Session):
         if not self._camera_sent:
             self._camera_sent = True
             self._camera_info.publish(self._wire.camera_info(stamp_ns, frame_id, frame.camera))
-            self._camera_info.wait_for_all_acked(Duration(seconds=5))  # it must be there before its first image
+            # It must be there before its first image; live, a reader that has just died must not stop all others.
+            limit_s = self._config.live_timeout_s if self._node.settings.live else 5.0
+            self._camera_info.wait_for_all_acked(Duration(seconds=limit_s))
         seq = self._in_flight.enter(stamp_ns)
         admitted = messages.Admitted(seq, self._entrance.dropped_total, self._epoch, int(self._resumed))
         self._admission.publish(self._wire.admission(stamp_ns, frame_id, admitted))
@@ -177,17 +210,14 @@ class SegmentationSession(Session):
             f"header.stamp steps back from {self._in_flight.admission.last_stamp_ns} ns to {stamp_ns} ns, "
             f"{RESTART_FRAMES} frames in a row: a new epoch begins, the target is sought anew"
         )
-        self._node.get_logger().warning(sentence)
-        self._diagnostics.report(WARN, sentence)
+        self._warn(sentence)
         self._camera_sent = False
         self._new_epoch()
 
     def _check_time(self) -> None:
-        """A stage that does not answer: a replay ends, a live graph goes on in a new epoch."""
+        """A stage that does not answer: a replay ends, a live graph goes on with the next frame."""
         overdue = self._in_flight.overdue()
         if overdue is not None:
-            self._new_epoch(resumed=self._last_state.is_confirmed)
-            self._is_open = False
             self._node.fail(overdue)
         elif self._is_open and len(self._entrance) and not self._entrance.is_calibrated:
             self._diagnostics.report(WARN, f"images arrive, but no calibration on {topics.CAMERA_INFO}")

@@ -38,7 +38,7 @@ class StageSession(Session, ABC):
     ) -> None:
         config = node.settings.config
         self._diagnostics = node.diagnostics
-        self._frames = JoinedFrames(joined, config.prior if uses_prior else None, stage.reset)
+        self._frames = JoinedFrames(joined, config.prior if uses_prior else None, stage.reset, node.settings.live)
         self._delay = ExtraDelay(node.NAME, config.graph.debug_stage_delay_ms)
         self._step_timer = StepTimer()
         self._answered = 0
@@ -55,7 +55,12 @@ class StageSession(Session, ABC):
 
     def values(self) -> dict[str, Any]:
         """Figures for diagnostics."""
-        counts = {"answered": self._answered, "waiting": len(self._frames), "late": self._frames.late}
+        counts = {
+            "answered": self._answered,
+            "waiting": len(self._frames),
+            "late": self._frames.late,
+            "lost": self._frames.lost,
+        }
         return counts | self._step_timer.values()
 
     def every_second(self) -> None:

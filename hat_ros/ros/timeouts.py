@@ -9,10 +9,23 @@ from hat_ros.errors import StageTimeoutError
 
 # Ends the sentence of a stage timeout, so that whatever started the node can tell it from other failures.
 HANGS = "a stage does not answer"
+# Far beyond any limit; more would leave the range of floats after hours.
+_DOUBLINGS = 16
 
 
-def answer_limit(config: GraphConfig, first: bool) -> tuple[float, str]:
-    """Seconds that a frame may take through the graph, and the option to raise; the first one also compiles code."""
+def answer_limit(config: GraphConfig, first: bool, given_up: int | None = None) -> tuple[float, str]:
+    """Seconds that a frame may take through the graph, and the option to raise; the first one also compiles code.
+
+    Args:
+        config: the limits.
+        first: no frame has been answered so far.
+        given_up: live: frames given up in a row. Each doubles the limit: otherwise a graph that is slow, not stuck,
+            would have ever more frames in its queues.
+    """
+    if given_up is not None and not first:
+        return min(
+            config.live_timeout_s * 2 ** min(given_up, _DOUBLINGS), config.stage_timeout_s
+        ), "graph.live_timeout_s"
     if first and config.startup_timeout_s > config.stage_timeout_s:
         return config.startup_timeout_s, "graph.startup_timeout_s"
     return config.stage_timeout_s, "graph.stage_timeout_s"

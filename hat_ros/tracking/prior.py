@@ -56,6 +56,12 @@ class PriorBuffer:
         """Whether every estimate that :meth:`before` would look at has arrived; the frame must have been admitted."""
         return all(estimate is not None for estimate in self._past(stamp_ns).values())
 
+    def drop_unanswered(self, stamp_ns: int) -> None:
+        """Forget the frames that :meth:`before` would look at and find without an estimate: they were given up."""
+        while lost := [stamp for stamp, estimate in self._past(stamp_ns).items() if estimate is None]:
+            for stamp in lost:
+                del self._frames[stamp]
+
     def before(self, stamp_ns: int) -> PosePrior | None:
         """Prior of a frame (admitted here if it is new), extrapolated at constant rate.
 

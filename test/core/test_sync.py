@@ -199,3 +199,16 @@ def test_giving_up_frees_all_credits_and_later_answers_are_strangers():
     assert admission.give_up() == (1, 2)
     assert admission.has_credit
     assert not admission.answered(1)
+
+
+def test_forgotten_stamps_let_older_ones_in_where_they_may_begin_anew():
+    for restarts in (True, False):
+        admission = Admission(1, restarts)
+        admission.admit(50)
+        admission.answered(50)
+        admission.forget_stamps()
+        if restarts:
+            assert admission.admit(7) == 1
+        else:
+            with pytest.raises(FrameError, match="must increase"):
+                admission.admit(7)

@@ -11,7 +11,8 @@ from hat_ros.errors import StageTimeoutError
 from hat_ros.ros.frames_in_flight import FramesInFlight
 from hat_ros.ros.timeouts import HANGS
 
-CONFIG = config_from_dict({"graph": {"credits_replay": 3, "stage_timeout_s": 30.0, "startup_timeout_s": 180.0}}).graph
+LIMITS = {"stage_timeout_s": 30.0, "startup_timeout_s": 180.0, "live_timeout_s": 1.0}
+CONFIG = config_from_dict({"graph": {"credits_replay": 3, "credits_live": 2, **LIMITS}}).graph
 
 
 @pytest.fixture
@@ -21,7 +22,7 @@ def clock(monkeypatch):
     return now
 
 
-@pytest.mark.parametrize(("live", "credits"), [(False, 3), (True, 1)])
+@pytest.mark.parametrize(("live", "credits"), [(False, 3), (True, 2)])
 def test_credits(live, credits):
     frames = FramesInFlight(CONFIG, live)
     for stamp in range(1, credits + 1):
@@ -51,3 +52,23 @@ def test_the_first_frame_may_take_longer(clock):
     assert str(error).endswith(HANGS)
     assert frames.admission.in_flight == ()
     assert frames.overdue() is None, "reported once"
+
+
+def test_live_a_late_frame_is_given_up_soon_and_later_each_time_in_a_row(clock):
+    frames = FramesInFlight(CONFIG, live=True)
+    frames.enter(1)
+    frames.leave(1)
+    for stamp, limit_s in ((2, 1.0), (3, 2.0), (4, 4.0)):
+        frames.enter(stamp)
+        clock[0] += limit_s
+        assert frames.overdue() is None
+        clock[0] += 0.1
+        assert f"no status for frame {stamp} within {limit_s:g} s" in str(frames.overdue())
+    assert not frames.leave(4), "its answer came too late to count"
+    frames.enter(5)
+    assert frames.leave(5)
+    frames.enter(6)
+    frames.enter(7)
+    clock[0] += 1.1
+    assert frames.overdue() is not None, "one in time, and the limit is the first again"
+    assert frames.given_up == 5

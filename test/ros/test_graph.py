@@ -204,8 +204,8 @@ def test_a_stage_that_hangs_is_named(clean_bag, config, tmp_path):
     assert len(read_result_bag(tmp_path / "out")) >= 3
 
 
-def test_live_goes_on_in_a_new_epoch_after_a_stage_hung(clean_bag, config, tmp_path):
-    patient = changed(config, graph={"stage_timeout_s": 2.0})
+def test_live_goes_on_after_a_stage_hung_and_forgets_nothing(clean_bag, config, tmp_path):
+    patient = changed(config, graph={"live_timeout_s": 1.0})
     pid = []
 
     def watch(progress):
@@ -216,15 +216,9 @@ def test_live_goes_on_in_a_new_epoch_after_a_stage_hung(clean_bag, config, tmp_p
             signal.setitimer(signal.ITIMER_REAL, 3.0)
 
     _, found = play(clean_bag, patient, tmp_path / "out", live=True, rate=0.25, on_progress=watch)
-    epochs = [np.frombuffer(payload)[2] for _, _, payload in found[topics.ADMISSION]]
-    assert epochs[0] == 0.0
-    assert epochs[-1] >= 1.0
+    assert {np.frombuffer(payload)[2] for _, _, payload in found[topics.ADMISSION]} == {0.0}, "one epoch"
+    assert stamps(found[topics.STATUS]) == stamps(found[topics.ADMISSION]), "late answers are answers, too"
     assert stamps(found[topics.STATUS])[-1] == ALL_STAMPS[-1]
-    first = epochs.index(1.0)
-    before = [stamp < stamps(found[topics.ADMISSION])[first] for stamp in stamps(found[topics.STATUS])]
-    last = TrackState(int(status_column(found, "state")[sum(before) - 1]))
-    resumed = [np.frombuffer(payload)[3] for _, _, payload in found[topics.ADMISSION]]
-    assert resumed[: first + 1] == [0.0] * first + [float(last.is_confirmed)], "the target was not lost"
 
 
 # ------------------------------------------------------------------ bad input

@@ -141,6 +141,23 @@ def test_a_lost_message_is_an_error_and_a_missing_one_is_named():
         frames.take()
 
 
+def test_live_a_frame_that_lacks_a_message_is_passed_over():
+    frames = JoinedFrames((topics.FRAME,), PriorConfig(enabled=True, delay_frames=1), lambda: None, live=True)
+    frames.put_camera(WIRE.camera_info(1, "cam", camera(10.0)))
+    put_frame(frames, 1)
+    frames.put(topics.ADMISSION, admission(2))
+    assert [joined.stamp_ns for joined in taken(frames)] == [1]
+    frames.put_status(status(1, x=0.5))
+    put_frame(frames, 3)
+    put_frame(frames, 4)
+    third, fourth = taken(frames)
+    assert [third.stamp_ns, fourth.stamp_ns] == [3, 4]
+    assert third.prior.pose_row[0] == fourth.prior.pose_row[0] == 0.5, "frame 3 has no estimate: it is not waited for"
+    assert (frames.lost, len(frames)) == (1, 0)
+    frames.put(topics.FRAME, WIRE.frame(2, "cam", RGB, None))
+    assert (frames.late, frames.take()) == (1, None)
+
+
 def test_a_stage_without_images_has_none():
     frames = JoinedFrames((topics.SLAM_STATE,), None, lambda: None)
     frames.put(topics.ADMISSION, admission(1))

@@ -4,55 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import rclpy
-from graph_clip import CONFIG_OVERRIDES
+from live_nodes import KINDS, WIRE, Camera, parameters
 from single_node import add, spin_until
 
 from hat_ros.core.sync import RESTART_FRAMES
-from hat_ros.io import messages, topics
+from hat_ros.io import messages
 from hat_ros.io.bag_reader import BagReader
-from hat_ros.ros import qos
-from hat_ros.ros.fusion_node import FusionNode
-from hat_ros.ros.hypotheses_node import HypothesesNode
-from hat_ros.ros.segmentation_node import SegmentationNode
-from hat_ros.ros.selector_node import SelectorNode
-from hat_ros.ros.slam_node import SlamNode
 from hat_ros.target.loading import load_target
 from hat_ros.tracker import HatTracker
 
-WIRE = messages.Wire.ros()
 PASSED = RESTART_FRAMES - 1
-
-
-def parameters(bag):
-    pairs = dict(item.split("=") for item in CONFIG_OVERRIDES)
-    return {name: int(value) for name, value in pairs.items()} | {"target": str(bag / "target.yaml"), "live": True}
-
-
-class Camera:
-    """Sends frame by frame; the next one only after the answer to the one before."""
-
-    def __init__(self, executor):
-        self.executor, self.node = executor, rclpy.create_node("camera", context=executor.context)
-        executor.add_node(self.node)
-        self.statuses, self.poses = [], []
-        make = self.node.create_publisher
-        self.image = make(messages.message_class(topics.TYPES[topics.IMAGE]), topics.IMAGE, qos.IN_REPLAY)
-        self.info = make(messages.message_class(topics.TYPES[topics.CAMERA_INFO]), topics.CAMERA_INFO, qos.IN_REPLAY)
-        for topic, out in ((topics.STATUS, self.statuses), (topics.TARGET_POSE, self.poses)):
-            kind, profile = messages.message_class(topics.TYPES[topic]), qos.profile_of(topic)
-            self.node.create_subscription(kind, topic, out.append, profile)
-
-    def send(self, frame, done):
-        self.image.publish(WIRE.image(frame.stamp_ns, "cam", "rgb8", frame.rgb))
-        assert spin_until(self.executor, done, turns=3000)
 
 
 @pytest.mark.graph
 def test_stamps_that_step_back_begin_a_new_epoch_in_every_stage(executor, clean_bag, config):
     frames = list(BagReader(clean_bag).frames())
-    kinds = (SegmentationNode, HypothesesNode, SlamNode, SelectorNode, FusionNode)
-    nodes = [add(executor, kind, **parameters(clean_bag)) for kind in kinds]
+    nodes = [add(executor, kind, **parameters(clean_bag)) for kind in KINDS.values()]
     for node in nodes:
         node.start()
     entrance, camera = nodes[0], Camera(executor)

@@ -154,3 +154,24 @@ def test_reset_forgets():
     buffer = _filled(20)
     buffer.reset()
     assert buffer.before(_stamp(20)) is None
+
+
+def test_frames_that_were_given_up_are_as_if_they_had_never_entered():
+    def asked(lost):
+        buffer = PriorBuffer(CONFIG)
+        for i in range(14):
+            if i not in lost:
+                buffer.admit(_stamp(i))
+                buffer.push(_estimate(i))
+        return buffer
+
+    with_holes, without = asked(()), asked((4, 7, 8, 9))
+    for i in (4, 7, 8, 9):
+        with_holes._frames[_stamp(i)] = None
+    for buffer in (with_holes, without):
+        buffer.admit(_stamp(14))
+        buffer.drop_unanswered(_stamp(14))
+        assert buffer.ready(_stamp(14))
+    found, expected = (buffer.before(_stamp(14)) for buffer in (with_holes, without))
+    assert found.stamp_ns == expected.stamp_ns
+    assert found.pose_row.tobytes() == expected.pose_row.tobytes()
