@@ -9,6 +9,8 @@ import numpy as np
 
 from hat_ros.config import HatConfig
 from hat_ros.geometry import lie
+from hat_ros.io.compressed import decode_compressed
+from hat_ros.io.images import NOTHING_KNOWN, encode_image
 from hat_ros.target.model import Target
 from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.tracker import HatTracker, Stage
@@ -59,7 +61,7 @@ def prepare(config: HatConfig, target: Target) -> list[Part]:
 
 
 def _frames(target: Target) -> list[Frame]:
-    """The target before black, turning a little."""
+    """The target before black, turning a little; images as a camera sends them, whose decoding is compiled, too."""
     K = np.array([[_FOCAL_PX, 0, _WIDTH / 2], [0, _FOCAL_PX, _HEIGHT / 2], [0, 0, 1]])
     camera = Camera(K, _WIDTH, _HEIGHT)
     renderer = RayRenderer(target)
@@ -68,5 +70,6 @@ def _frames(target: Target) -> list[Frame]:
     for index in range(_FRAMES):
         R = lie.so3_exp(np.array([0.6, 0.4 + index * _TURN_RAD, 0.2]))
         T = lie.transform(R, np.array([0, 0, distance]) - R @ target.center_m)
-        frames.append(Frame((index + 1) * 100_000_000, renderer.render(T, camera).rgb, camera))
+        image = encode_image(renderer.render(T, camera).rgb, "jpeg")
+        frames.append(Frame((index + 1) * 100_000_000, decode_compressed(image, NOTHING_KNOWN)[0], camera))
     return frames

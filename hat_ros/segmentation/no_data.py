@@ -2,6 +2,10 @@
 
 Before a sky that is not zero itself such a border passes for the sky, and the sky's floor for the target. So the border
 is filled with pixels of the sky beside it. An ordinary black sky, whose own zeros reach the border, is left as it is.
+
+So is an image whose target lies along more than a tenth of such a border: filled with sky, it would end in a straight
+edge that is none of the target's. A border cuts a target off as the edge of the image does, but nothing after
+segmentation can be told where the picture ends.
 """
 
 from __future__ import annotations

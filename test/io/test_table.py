@@ -50,6 +50,6 @@ def test_empty_tables_keep_their_fields():
 
 
 def test_a_single_row_table_with_two_rows_is_rejected():
-    message = ROS.table(STAMP, "cam", topics.ADMISSION_COLUMNS, np.zeros((2, 3)))
+    message = ROS.table(STAMP, "cam", topics.ADMISSION_COLUMNS, np.zeros((2, len(topics.ADMISSION_COLUMNS))))
     with pytest.raises(WireError, match="one row, found 2"):
         messages.admitted_from(message)
