@@ -16,6 +16,7 @@ from hat_ros.core.selector import SelectorStage
 from hat_ros.hypotheses.stage import HypothesisStage
 from hat_ros.motion.stage import MotionStage
 from hat_ros.segmentation.stage import SegmentationStage
+from hat_ros.target.exact_symmetry import symmetry_of
 from hat_ros.target.model import Target
 from hat_ros.tracking.prior import PriorBuffer
 from hat_ros.types import Candidates, Detection, Estimate, Frame, Motion, Selection
@@ -61,7 +62,7 @@ class HatTracker:
         self.hypotheses = wrap("hypotheses", HypothesisStage(config, target))
         self.motion = wrap("motion", MotionStage(config, target))
         self.selector = wrap("selector", SelectorStage(config.selector))
-        self.fusion = wrap("fusion", FusionStage(config, choose_fusion(config, target)))
+        self.fusion = wrap("fusion", FusionStage(config, choose_fusion(config, target), symmetry_of(target)))
         self.priors = PriorBuffer(config.prior)
 
     def step(self, frame: Frame) -> Step:

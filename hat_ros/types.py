@@ -7,7 +7,7 @@ quaternion); ``T_cam_target`` and friends are derived. All types are frozen; arr
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
 
@@ -16,6 +16,7 @@ import numpy as np
 from hat_ros.array_types import Bool, Float, UInt8
 from hat_ros.errors import CandidateError, FrameError
 from hat_ros.geometry import lie
+from hat_ros.geometry.symmetry import Symmetry
 
 MAX_IMAGE_SIDE_PX = 8192
 # Values of a given mask (``Frame.given_mask``), beside 0 for outside.
@@ -196,6 +197,22 @@ class Candidates:
     def T_cam_target(self) -> Float:
         """(K, 4, 4) poses."""
         return lie.matrix_from_row(self.pose_rows)
+
+    def nearest(self, symmetry: Symmetry, R_reference: Float | None) -> Candidates:
+        """The same candidates, each as the pose that looks like it and is nearest to a rotation (3, 3).
+
+        Poses that no image can tell apart are then one. None: the rotation of the best candidate. NaN: unchanged.
+        """
+        alive = np.isfinite(self.log_score)
+        if symmetry.is_trivial or not alive.any():
+            return self
+        if R_reference is not None and not np.isfinite(R_reference).all():
+            return self
+        T = self.T_cam_target[alive]
+        reference = T[np.argmax(self.log_score[alive]), :3, :3] if R_reference is None else R_reference
+        rows = self.pose_rows.copy()
+        rows[alive] = lie.row_from_matrix(symmetry.nearest(T, reference))
+        return replace(self, pose_rows=rows)
 
     def lead(self, apart_deg: float) -> float:
         """Lead in log score of the best one's basin over the best outside it, as :meth:`Selection.margin`."""
@@ -451,6 +468,8 @@ class Estimate:
         margin: lead of the output's basin over all others at the last keyframe, in units of path score; NaN before
             the first. The smaller, the more ambiguous; for people (diagnostics) and the state.
         reason: why the state is what it is.
+        order: number of orientations that look like this one, itself included: 1 without a symmetry of the target.
+        free_axes: number of axes about which the target may be turned without a difference: 0, 1, or 3 for a ball.
     """
 
     stamp_ns: int
@@ -467,6 +486,8 @@ class Estimate:
     n_resets: int = 0
     margin: float = float("nan")
     reason: StateReason = StateReason.UNSTATED
+    order: int = 1
+    free_axes: int = 0
 
     @cached_property
     def T_cam_target(self) -> Float:

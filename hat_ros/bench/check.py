@@ -20,6 +20,7 @@ from hat_ros.io.bag_files import bag_files
 from hat_ros.io.bag_reader import BagReader
 from hat_ros.io.manifest import MANIFEST
 from hat_ros.io.topic_choice import CAMERA_INFO_KIND, COMPRESSED_KIND, IMAGE_KIND
+from hat_ros.target.exact_symmetry import symmetry_of
 from hat_ros.target.loading import find_model
 from hat_ros.target.model import Target
 from hat_ros.target.symmetry import near_symmetries
@@ -57,7 +58,7 @@ def notes() -> Iterator[list[Line]]:
 
 
 def cad_lines(path: Path, target: Target, unit_scale: float | None = 1.0) -> Iterator[Line]:
-    """The CAD model: file, unit, size, faces, colours, near-symmetries.
+    """The CAD model: file, unit, size, faces, colours, symmetries.
 
     Args:
         path: CAD file or ``target.yaml``, as it was given to :func:`hat_ros.target.loading.load_target`.
@@ -79,10 +80,13 @@ def cad_lines(path: Path, target: Target, unit_scale: float | None = 1.0) -> Ite
         target.surface.textures or target.surface.corner_rgb is not None or (target.face_rgb != _GREY).any()
     )
     yield "colours", f"yes, {len(target.surface.textures)} textures" if has_color else "none, taken as grey"
+    exact = symmetry_of(target)
+    how = "found" if target.declared_symmetry is None else "declared"
+    yield "symmetry", f"{how}: a pose is {exact.words()}" if exact.words() else f"none {how}"
     if len(target.faces) > _MAX_SYMMETRY_FACES:
         yield "near-symmetries", f"not looked for beyond {_MAX_SYMMETRY_FACES} faces"
         return
-    angles = [f"{np.degrees(lie.angle_between(turn, np.eye(3))):.0f} deg" for turn in near_symmetries(target)]
+    angles = [f"{np.degrees(lie.angle_between(turn, np.eye(3))):.0f} deg" for turn in near_symmetries(target, exact)]
     yield "near-symmetries", f"turns of {', '.join(angles)} hardly change the silhouette" if angles else "none"
 
 

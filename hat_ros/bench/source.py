@@ -21,7 +21,7 @@ from hat_ros.geometry import lie
 from hat_ros.io.bag_files import is_bag
 from hat_ros.io.bag_reader import BagReader, Packet
 from hat_ros.io.provenance import input_hash
-from hat_ros.target.loading import find_model, load_target
+from hat_ros.target.loading import load_target
 from hat_ros.target.mesh_file import companions_of
 from hat_ros.target.model import Target
 from hat_ros.types import Frame
@@ -71,7 +71,7 @@ class SourceSpec:
             digest.update(b"\0".join((str(item.stamp_ns).encode(), truth, box)))
             for path in (item.image, *item.masks):
                 digest.update(input_hash(path).encode())
-        model = find_model(recording.target_path, recording.unit_scale)
+        model = recording.model_file()
         for path in dict.fromkeys((recording.target_path, model.mesh, *companions_of(model.mesh).values())):
             digest.update(input_hash(path).encode())
         return self._with_detections(digest.hexdigest())
@@ -228,4 +228,4 @@ def open_source(
 def _source_of_images(path: Path, recording: ImageRecording, camera_config: CameraConfig | None) -> Source:
     if camera_config is not None:
         recording = replace(recording, image_depth=camera_config.image_depth)
-    return Source(path, recording, load_target(recording.target_path, recording.unit_scale))
+    return Source(path, recording, recording.load_target())

@@ -96,6 +96,8 @@ _BENCH_COLUMNS = """\
 columns:
   E_p, E_t, E_q, SD   pose, translation and rotation error: mean and sample standard deviation over scored frames
   >90                 share of scored frames more than 90 degrees off
+  E_p sym             E_p to the nearest of the orientations that look alike; the same as E_p without a symmetry
+  MSSD, MSPD          largest distance of a vertex from the nearest such truth, in metres and in pixels (BOP)
   cover               share of frames with ground truth that got a pose
   best<15, best<30    keyframes where the best of the K candidates is within 15 and 30 degrees
   IoU, IoU>.9         overlap of detected and recorded mask: mean, share of frames at 0.9 or better

@@ -24,6 +24,7 @@ columns:
   best of 10       keyframes where the best of ten hypotheses is within 15 degrees
   in 95 %          TRACKING frames whose truth lies inside the stated 95 % ellipsoid
   cpu ms           processor time per frame: of segmentation (mean, 99th percentile), of all stages
+  symmetric craft  E_p and angles are to the nearest of the orientations that look alike
   IoU              overlap of mask and true silhouette, 0 for a missing mask, where the craft spans 30 px
   in brackets      95 % intervals: Wilson for clips, bootstrap over clips for the others
 examples:

@@ -96,6 +96,7 @@ def figure_lines(figures: dict[str, Any]) -> list[tuple[str, str]]:
         *[("refused", f"{reason['count']} x {reason['first']}") for reason in figures.get("refused_reasons", ())],
         *([("dropped", str(figures["dropped"]))] if figures.get("dropped") else []),
         ("pose error E_p", f"{number('E_p_mean')} (SD {number('E_p_sd')})"),
+        *([("E_p to the nearest equal", number("E_p_sym_mean"))] if _is_symmetric(figures) else []),
         ("translation error E_t", f"{number('E_t_m_mean')} m (SD {number('E_t_m_sd')})"),
         ("rotation error E_q", f"{number('E_q_deg_mean', '.2f')} deg (SD {number('E_q_deg_sd', '.2f')})"),
         ("beyond 90 degrees", number("E_q_over_90_share", ".1%")),
@@ -104,6 +105,11 @@ def figure_lines(figures: dict[str, Any]) -> list[tuple[str, str]]:
         latency = f"p50 {number('latency_ms_p50', '.1f')} ms, p99 {number('latency_ms_p99', '.1f')} ms"
         lines.append(("speed", f"{number('fps', '.1f')} frames/s, latency {latency}"))
     return lines
+
+
+def _is_symmetric(figures: dict[str, Any]) -> bool:
+    """Whether some poses of the target look alike."""
+    return figures.get("symmetry_order", 1) > 1 or figures.get("symmetry_free_axes", 0) > 0
 
 
 @contextmanager

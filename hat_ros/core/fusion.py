@@ -8,6 +8,7 @@ for.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -19,6 +20,7 @@ from hat_ros.core.covariance import ResidualCovariance
 from hat_ros.core.published_fusion import Fused
 from hat_ros.core.selector import rotation_increment
 from hat_ros.geometry import lie
+from hat_ros.geometry.symmetry import Symmetry
 from hat_ros.types import Detection, Estimate, Frame, Motion, Selection, StateReason, TrackState
 
 _NO_POSE = np.full(7, np.nan)
@@ -61,15 +63,25 @@ class FusionMethod(Protocol):
 class FusionStage:
     """One :meth:`update` per frame; past outputs are never revised.
 
+    Of poses that no image can tell apart the one nearest to the last output counts, carried on by the relative motion:
+    the output of a symmetric target is continuous, its candidates stand in one basin, and its rotation about a free
+    axis, of which nothing is known, has the variance of a full turn.
+
+    Args:
+        config: the whole configuration.
+        method: what solves for the pose.
+        symmetry: of the target; None = it has none.
+
     States: UNINITIALISED before the first pose. TRACKING while the method is certain of the pose that it solved for.
     While the pose is only held, predicted, ambiguous, or in doubt: COASTING if it has been TRACKING since the target
     was found, else INITIALISING. LOST once ``coast_limit_frames`` went by without a measurement (an anchor, or a
     supported refinement), unless that is 0; no pose then, and what is found afterwards has to be confirmed anew.
     """
 
-    def __init__(self, config: HatConfig, method: FusionMethod) -> None:
+    def __init__(self, config: HatConfig, method: FusionMethod, symmetry: Symmetry | None = None) -> None:
         self._config = config
         self._method = method
+        self._symmetry = symmetry or Symmetry()
         self._start()
 
     def reset(self) -> None:
@@ -94,6 +106,7 @@ class FusionStage:
 
     def update(self, frame: Frame, detection: Detection | None, motion: Motion, selection: Selection) -> Estimate:
         """Estimate the pose of one frame; arguments as for :meth:`FusionMethod.update`."""
+        selection = self._one_of_equals(selection, motion)
         fused = self._method.update(frame, detection, motion, selection)
         self._n_resets += fused.reset
         if fused.T_cam_target is not None and selection.selected >= 0:
@@ -104,6 +117,8 @@ class FusionStage:
             pose_row = self._row(T_cam_target)
             covariance = self._covariance.update(T_cam_target, fused.measurement, fused.predicted, fused.covariance)
             covariance = covariance + self._method.spread(selection, T_cam_target)
+            if not self._symmetry.is_trivial:
+                covariance = covariance + self._symmetry.free_covariance(T_cam_target)
         self._last_motion = motion
         return Estimate(
             stamp_ns=frame.stamp_ns,
@@ -120,7 +135,18 @@ class FusionStage:
             n_resets=self._n_resets,
             margin=self._margin,
             reason=reason,
+            order=self._symmetry.order,
+            free_axes=len(self._symmetry.axes),
         )
+
+    def _one_of_equals(self, selection: Selection, motion: Motion) -> Selection:
+        """The selection with each candidate as the equal that the track leads to; unchanged without a symmetry."""
+        if self._symmetry.is_trivial or self._last_pose is None:
+            return selection
+        increment = rotation_increment(self._last_motion, motion)
+        R_last = self._last_pose[:3, :3]
+        R_reference = R_last if increment is None else increment @ R_last
+        return replace(selection, candidates=selection.candidates.nearest(self._symmetry, R_reference))
 
     def _state(self, fused: Fused, motion: Motion) -> tuple[TrackState, StateReason, Float | None]:
         """State, why, and pose after gap handling."""

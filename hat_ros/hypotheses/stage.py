@@ -10,6 +10,7 @@ from hat_ros.core.cadence import Cadence
 from hat_ros.core.guard import guard_candidates
 from hat_ros.core.keyframes import KeyframeSchedule
 from hat_ros.stages import create_backend
+from hat_ros.target.exact_symmetry import symmetry_of
 from hat_ros.target.model import Target
 from hat_ros.types import Candidates, Detection, Frame, PosePrior
 
@@ -34,6 +35,8 @@ class HypothesisStage:
         self._cadence = Cadence()
         self._apart_deg, self._min_lead = config.fusion.gate_angle_deg, config.refinement.min_margin
         self._backend = create_backend("hypotheses", config, target)
+        self._symmetry = symmetry_of(target)
+        self._R_reference: Float | None = None
         self._newest: Detection | None = None
         self._changed = False
 
@@ -54,7 +57,7 @@ class HypothesisStage:
         if len(candidates) > self._max_candidates:
             keep = slice(self._max_candidates)
             candidates = Candidates(candidates.pose_rows[keep], candidates.log_score[keep], candidates.box_xyxy)
-        candidates = guard_candidates(candidates, self._drop_implausible)
+        candidates = self._one_of_equals(guard_candidates(candidates, self._drop_implausible), prior)
         self._schedule.answered(decided=candidates.lead(self._apart_deg) >= self._min_lead)
         return candidates
 
@@ -63,7 +66,18 @@ class HypothesisStage:
         self._schedule.reset()
         self._cadence.reset()
         self._backend.reset()
-        self._newest, self._changed = None, False
+        self._newest, self._changed, self._R_reference = None, False, None
+
+    def _one_of_equals(self, candidates: Candidates, prior: PosePrior | None) -> Candidates:
+        """Of orientations that look alike the one nearest to the track, or without one to the last keyframe's best.
+
+        So the decoder compares like with like from keyframe to keyframe.
+        """
+        R_reference = self._R_reference if prior is None else prior.T_cam_target[:3, :3]
+        candidates = candidates.nearest(self._symmetry, R_reference)
+        if len(candidates):
+            self._R_reference = candidates.T_cam_target[np.argmax(candidates.log_score), :3, :3]
+        return candidates
 
     def _observe(self, detection: Detection | None) -> None:
         """Note when a detection is of something else than the one before, lacks a part of it or holds more."""

@@ -18,6 +18,7 @@ import yaml
 from hat_ros.array_types import Float, UInt8
 from hat_ros.errors import RunError
 from hat_ros.geometry import lie
+from hat_ros.geometry.symmetry import Symmetry, declaration_of
 from hat_ros.io import messages, topics
 from hat_ros.io.images import encode_image
 from hat_ros.io.lens import Lens
@@ -121,18 +122,22 @@ class BagWriter:
         kind = "png" if data[:4] == b"\x89PNG" else "jpeg"
         self.write_message(topics.IMAGE_COMPRESSED, make.compressed(stamp_ns, frame_id, kind, data), stamp_ns)
 
-    def write_target(self, mesh: str | Path, unit_scale: float = 1.0, name: str | None = None) -> None:
+    def write_target(
+        self, mesh: str | Path, unit_scale: float = 1.0, name: str | None = None, symmetry: Symmetry | None = None
+    ) -> None:
         """Put a copy of the CAD model, of what it names beside it, and a ``target.yaml`` into the bag's folder.
 
         Args:
             mesh: the model's file.
             unit_scale: metres per unit of the file.
             name: name of the target, by default that of the file.
+            symmetry: what is declared of it; None = nothing.
         """
         mesh = Path(mesh)
         with _as_run_error(self.path):
             copy = copy_model(mesh, self.path)
             content = {"mesh": copy, "unit_scale": float(unit_scale), "name": name or mesh.stem}
+            content |= {} if symmetry is None else declaration_of(symmetry)
             (self.path / TARGET_FILE).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
 
     def close(self) -> None:

@@ -83,7 +83,7 @@ class StageWire(TableWire):
         version = 0 if e.alignment is None else e.alignment.version
         head = [e.state, admitted.seq, e.keyframe, e.n_candidates, e.anchor, e.gate_weight]
         tail = [version, e.slam_epoch, e.gap_frames, admitted.dropped_total]
-        row = np.concatenate([head, tail, e.pose_row, [e.reason], e.covariance[_UPPER]])
+        row = np.concatenate([head, tail, e.pose_row, [e.reason], e.covariance[_UPPER], [e.order, e.free_axes]])
         return self.table(e.stamp_ns, frame_id, topics.STATUS_COLUMNS, row)
 
 
@@ -163,7 +163,7 @@ def status_from(message: Any) -> Status:
     state = whole_number("state", row["state"])
     if state not in set(TrackState):
         raise WireError(f"column 'state' must be 0 to {max(TrackState)}, found {state}")
-    reason = 0 if np.isnan(row["reason"]) else whole_number("reason", row["reason"])
+    reason = _count("reason", row, StateReason.UNSTATED)
     pose_row = np.array([row[name] for name in topics.POSE_COLUMNS])
     if TrackState(state).has_pose:
         check_poses(pose_row)
@@ -178,6 +178,8 @@ def status_from(message: Any) -> Status:
         gate_weight=row["gate_weight"],
         slam_epoch=whole_number("slam_epoch", row["slam_epoch"]),
         gap_frames=whole_number("gap_frames", row["gap_frames"]),
+        order=_count("order", row, 1),
+        free_axes=_count("free_axes", row, 0),
         # A reason that a newer writer knows is none to this reader.
         reason=StateReason(reason) if reason in set(StateReason) else StateReason.UNSTATED,
     )
@@ -187,6 +189,11 @@ def status_from(message: Any) -> Status:
         whole_number("dropped_total", row["dropped_total"]),
         whole_number("alignment_version", row["alignment_version"]),
     )
+
+
+def _count(name: str, row: dict[str, float], otherwise: int) -> int:
+    """A whole number of a later column, or what stands for it where an older writer has none."""
+    return otherwise if np.isnan(row[name]) else whole_number(name, row[name])
 
 
 def _covariance(row: dict[str, float]) -> Float:

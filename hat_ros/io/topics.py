@@ -99,6 +99,8 @@ STATUS_COLUMNS = (
     "reason",
     # Upper triangle, row by row.
     *(f"cov{i}{j}" for i in range(6) for j in range(i, 6)),
+    "order",
+    "free_axes",
 )
 # Those of the first release: columns are added at the end only, and readers accept fewer and more from here on.
 N_STATUS_AT_FIRST = 17

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from hat_ros.core.fusion import FusionStage
+from hat_ros.geometry.symmetry import known_up_to
 from hat_ros.io import messages, topics
 from hat_ros.ros import process
 from hat_ros.ros.diagnostics import OK
@@ -16,6 +17,7 @@ from hat_ros.ros.node import HatNode
 from hat_ros.ros.pose_output import PoseOutput
 from hat_ros.ros.session import Session
 from hat_ros.ros.stage_node import StageSession
+from hat_ros.target.exact_symmetry import symmetry_of
 from hat_ros.tracker import choose_fusion
 from hat_ros.types import Camera, Detection, Estimate, Frame
 
@@ -30,7 +32,7 @@ class FusionSession(StageSession):
     def __init__(self, node: HatNode[Session]) -> None:
         settings, config = node.settings, node.settings.config
         target = settings.load_target()
-        self._stage = FusionStage(config, choose_fusion(config, target))
+        self._stage = FusionStage(config, choose_fusion(config, target), symmetry_of(target))
         images = (topics.FRAME,) if config.refinement.enabled else ()
         super().__init__(node, self._stage, (topics.SLAM_STATE, topics.SELECTION, *images))
         self._wire = node.wire
@@ -54,7 +56,9 @@ class FusionSession(StageSession):
         self._pose.publish(joined.frame_id, estimate)
         self._estimate = estimate
         self._status.publish(self._wire.status(joined.frame_id, estimate, admitted))
-        self._diagnostics.report(OK, f"{estimate.state.name.lower()}: {estimate.reason.words}")
+        up_to = known_up_to(estimate.order, estimate.free_axes)
+        words = f"{estimate.reason.words}; {up_to}" if up_to else estimate.reason.words
+        self._diagnostics.report(OK, f"{estimate.state.name.lower()}: {words}")
 
     def values(self) -> dict[str, Any]:
         """Figures for diagnostics; the smaller the margin, the more ambiguous the orientation."""

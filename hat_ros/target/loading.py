@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import trimesh
 
 from hat_ros.array_types import Bool, Float, Float32, Int, Int32, UInt8
 from hat_ros.errors import MeshError
+from hat_ros.geometry.symmetry import Symmetry
 from hat_ros.target.companions import say_once
 from hat_ros.target.mesh_file import read_scene, read_target_yaml
 from hat_ros.target.model import Surface, Target, area_vectors, triangle_areas
@@ -44,17 +45,20 @@ class ModelFile:
         mesh: the file.
         unit_scale: metres per unit of the file.
         name: name of the target.
+        symmetry: what is declared of it; None = nothing.
     """
 
     mesh: Path
     unit_scale: float
     name: str
+    symmetry: Symmetry | None = None
 
 
 def find_model(path: str | Path, unit_scale: float | None = 1.0) -> ModelFile:
     """The CAD file that a path names, itself or through a ``target.yaml``.
 
-    ``target.yaml`` holds ``mesh`` (file beside it), ``unit_scale`` (metres per file unit, or ``auto``) and ``name``.
+    ``target.yaml`` holds ``mesh`` (file beside it), ``unit_scale`` (metres per file unit, or ``auto``), ``name``, and
+    may declare symmetries as BOP does, in metres: ``symmetries_discrete`` and ``symmetries_continuous``.
 
     Args:
         path: obj, ply, stl, glb or a ``target.yaml``.
@@ -66,11 +70,12 @@ def find_model(path: str | Path, unit_scale: float | None = 1.0) -> ModelFile:
     path = Path(path)
     if not path.is_file():
         raise MeshError(f"CAD model {path}: no such file")
-    stated, name = unit_scale, path.stem
+    stated, name, symmetry = unit_scale, path.stem, None
     if path.suffix.lower() in (".yaml", ".yml"):
-        path, stated, name = read_target_yaml(path)
+        path, stated, name, symmetry = read_target_yaml(path)
         stated = None if stated is None or unit_scale is None else unit_scale * stated
-    return ModelFile(path, guess_unit_scale(read_scene(path), path) if stated is None else stated, name)
+    scale = guess_unit_scale(read_scene(path), path) if stated is None else stated
+    return ModelFile(path, scale, name, symmetry)
 
 
 def load_target(path: str | Path, unit_scale: float | None = 1.0) -> Target:
@@ -84,7 +89,8 @@ def load_target(path: str | Path, unit_scale: float | None = 1.0) -> Target:
         MeshError: unreadable, other format, empty, not finite, or of absurd size or extent.
     """
     model = find_model(path, unit_scale)
-    return target_from_scene(read_scene(model.mesh), model.name, model.unit_scale)
+    target = target_from_scene(read_scene(model.mesh), model.name, model.unit_scale)
+    return replace(target, declared_symmetry=model.symmetry)
 
 
 def target_from_scene(scene: trimesh.Scene, name: str, unit_scale: float = 1.0) -> Target:

@@ -17,20 +17,23 @@ import trimesh
 
 from hat_ros.config.yaml_text import read_yaml
 from hat_ros.errors import ConfigError, MeshError
+from hat_ros.geometry.symmetry import Symmetry, symmetry_from_declaration
 from hat_ros.target.brep import BREP_SUFFIXES, glb_of_brep
 from hat_ros.target.companions import MATERIAL_SUFFIX, Companions, copy_with_companions, say_once
 from hat_ros.target.obj_text import material_libraries, plain_obj
 from hat_ros.target.units import AUTO
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb", *BREP_SUFFIXES)
+_SYMMETRY_KEYS = ("symmetries_discrete", "symmetries_continuous")
+_TARGET_KEYS = ("mesh", "unit_scale", "name", *_SYMMETRY_KEYS)
 MAX_FILE_BYTES = 256 * 2**20
 MAX_FACES = 4_000_000
 MAX_VERTICES = 8_000_000
 MAX_NODES = 20_000
 
 
-def read_target_yaml(path: Path) -> tuple[Path, float | None, str]:
-    """Mesh file, metres per unit (None = to be guessed) and name from a ``target.yaml``.
+def read_target_yaml(path: Path) -> tuple[Path, float | None, str, Symmetry | None]:
+    """Mesh file, metres per unit (None = to be guessed), name and declared symmetry from a ``target.yaml``.
 
     Raises:
         MeshError: malformed, or the mesh does not lie beside it.
@@ -41,9 +44,9 @@ def read_target_yaml(path: Path) -> tuple[Path, float | None, str]:
         raise MeshError(str(error)) from None
     if not isinstance(data, dict) or not isinstance(data.get("mesh"), str):
         raise MeshError(f"{path}: expected a mapping with the key 'mesh' naming a file beside it")
-    unknown = sorted(set(map(str, data)) - {"mesh", "unit_scale", "name"})
+    unknown = sorted(set(map(str, data)) - set(_TARGET_KEYS))
     if unknown:
-        raise MeshError(f"{path}: unknown key '{unknown[0]}', known keys are mesh, unit_scale, name")
+        raise MeshError(f"{path}: unknown key '{unknown[0]}', known keys are {', '.join(_TARGET_KEYS)}")
     scale = data.get("unit_scale", 1.0)
     if scale != AUTO and (isinstance(scale, bool) or not isinstance(scale, (int, float))):
         raise MeshError(f"{path}: unit_scale must be a number or '{AUTO}', found {scale!r}")
@@ -52,7 +55,14 @@ def read_target_yaml(path: Path) -> tuple[Path, float | None, str]:
         raise MeshError(f"{path}: mesh '{data['mesh']}' must lie in the same folder")
     if mesh.suffix.lower() not in MESH_SUFFIXES:
         raise MeshError(f"{path}: mesh '{data['mesh']}' must be one of {', '.join(MESH_SUFFIXES)}")
-    return mesh, None if scale == AUTO else float(scale), str(data.get("name", mesh.stem))
+    symmetry = None
+    if set(_SYMMETRY_KEYS) & set(data):
+        try:
+            discrete, continuous = (data.get(key, []) for key in _SYMMETRY_KEYS)
+            symmetry = symmetry_from_declaration(discrete, continuous, unit_m=1.0)
+        except ValueError as error:
+            raise MeshError(f"{path}: {error}") from None
+    return mesh, None if scale == AUTO else float(scale), str(data.get("name", mesh.stem)), symmetry
 
 
 def read_scene(path: Path) -> trimesh.Scene:

@@ -14,6 +14,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist
 
 from hat_ros.array_types import Float, Float32, Int32, UInt8
+from hat_ros.geometry.symmetry import Symmetry
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +72,7 @@ class Target:
         face_rgb: (F, 3) uint8 mean sRGB colour of each face, grey (160) when the file has no colours.
         surface: textures and gloss, for rendering.
         sha256: hexadecimal digest of geometry and colours as loaded (unit scale included), the key of caches.
+        declared_symmetry: what ``target.yaml`` or a data set declares; None = it is found from the model.
     """
 
     name: str
@@ -79,6 +81,7 @@ class Target:
     face_rgb: UInt8
     surface: Surface
     sha256: str
+    declared_symmetry: Symmetry | None = None
 
     @cached_property
     def center_m(self) -> Float:

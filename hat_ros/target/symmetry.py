@@ -6,6 +6,8 @@ find one of its orientations only, and a predicted pose brings only its own.
 
 from __future__ import annotations
 
+import hashlib
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -13,6 +15,8 @@ from hat_ros.array_types import Float, UInt8
 from hat_ros.cache import cached_arrays
 from hat_ros.geometry import lie
 from hat_ros.geometry.masks import overlap
+from hat_ros.geometry.symmetry import Symmetry
+from hat_ros.target.exact_symmetry import symmetry_of
 from hat_ros.target.model import Target
 from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.target.sphere import look_inwards
@@ -32,13 +36,18 @@ _SEPARATION_DEG = 15.0
 def load_or_find_symmetries(target: Target) -> Float:
     """:func:`near_symmetries` from the cache folder, found and stored there when it is absent or damaged."""
     key = f"{target.sha256}:{_FORMAT}:{_SIDE_PX}:{_DISTANCE_RADII}:{_N_VIEWS}:{_MIN_OVERLAP}:{_MAX_TURNS}"
-    return cached_arrays("near-symmetries", key, lambda: {"turns": near_symmetries(target)})["turns"]
+    exact = symmetry_of(target)
+    if not exact.is_trivial:
+        digest = hashlib.sha256(np.concatenate([exact.turns.ravel(), exact.axes.ravel()]).tobytes())
+        key = f"{key}:{digest.hexdigest()}"
+    return cached_arrays("near-symmetries", key, lambda: {"turns": near_symmetries(target, exact)})["turns"]
 
 
-def near_symmetries(target: Target) -> Float:
+def near_symmetries(target: Target, exact: Symmetry | None = None) -> Float:
     """(S, 3, 3) rotations of the target about its centre, those that change its silhouettes least first.
 
-    Quarter, third and half turns about the axes of the file and about the principal axes of the surface.
+    Quarter, third and half turns about the axes of the file and about the principal axes of the surface, but for those
+    that an exact symmetry makes equal to none.
     """
     renderer = RayRenderer(target)
     focal = 0.47 * _SIDE_PX * np.sqrt(_DISTANCE_RADII**2 - 1.0)
@@ -52,6 +61,11 @@ def near_symmetries(target: Target) -> Float:
 
     as_it_is = silhouettes(np.eye(3))
     turns = _turns(target)
+    if exact is not None and not exact.is_trivial:
+        nearest = exact.nearest(lie.transform(turns, np.zeros((len(turns), 3))), np.eye(3))
+        turns = turns[np.degrees(lie.angle_between(nearest[:, :3, :3], np.eye(3))) > _SEPARATION_DEG]
+        if not len(turns):
+            return turns
     alike = np.array([np.mean([overlap(a, b) for a, b in zip(as_it_is, silhouettes(t), strict=True)]) for t in turns])
     order = np.argsort(-alike, kind="stable")
     return turns[order[alike[order] >= _MIN_OVERLAP][:_MAX_TURNS]]

@@ -9,6 +9,7 @@ from hat_ros.core.fusion import FusionStage
 from hat_ros.core.published_fusion import PublishedFusion
 from hat_ros.core.selector import SelectorStage
 from hat_ros.geometry import lie
+from hat_ros.geometry.symmetry import FREE_VARIANCE_RAD2, Symmetry, about_center
 from hat_ros.types import Camera, Candidates, Frame, Motion, Selection, TrackState
 
 
@@ -162,3 +163,51 @@ class TestCovariance:
         own = np.diag([1e-4] * 6)
         np.testing.assert_array_equal(covariance.update(T, T, None, own), own)
         assert np.trace(covariance.update(T, None, T, None)) > np.trace(own)
+
+
+QUARTERS = Symmetry(about_center(lie.so3_exp(np.outer(np.arange(4) * np.pi / 2, [0, 0, 1.0])), np.zeros(3)))
+
+
+def _run_among_equals(stage, scene):
+    """At each keyframe the four equals of the true pose; the anchor is another one each time."""
+    out, n = [], 0
+    for i in range(len(scene.T_cam_target)):
+        selection = Selection.none()
+        if scene.observations.key[i]:
+            T, n = scene.T_cam_target[i] @ np.roll(QUARTERS.turns, n, axis=0), n + 1
+            score = np.zeros(len(T))
+            selection = Selection(Candidates(lie.row_from_matrix(T), score), score, score, 0)
+        out.append(stage.update(frame(i), None, scene.observations.motion(i), selection))
+    return out
+
+
+@pytest.mark.parametrize("free", [False, True])
+def test_the_output_of_a_symmetric_target_is_continuous(free):
+    scene = make_scene(120)
+    symmetry = Symmetry(axes=np.array([[0, 0, 1.0]])) if free else QUARTERS
+    stage = FusionStage(preset(), PublishedFusion(preset()), symmetry)
+    estimates = [e for e in _run_among_equals(stage, scene) if e.state.has_pose]
+    R = np.stack([e.T_cam_target[:3, :3] for e in estimates])
+    step_deg = np.degrees(lie.angle_between(R[1:], R[:-1]))
+    R_true = scene.T_cam_target[-len(R) :, :3, :3]
+    true_step_deg = np.degrees(lie.angle_between(R_true[1:], R_true[:-1]))
+    assert step_deg.max() < 4.0 * true_step_deg.max() + 0.1, "at first it is held between keyframes"
+    assert {(e.order, e.free_axes) for e in estimates} == {(1, 1) if free else (4, 0)}
+    nearest = symmetry.nearest(scene.T_cam_target[-len(R) :], R)
+    assert np.degrees(lie.angle_between(nearest[:, :3, :3], R)).max() < 3.1
+
+    unaware = _run_among_equals(_stage(preset()), scene)
+    R = np.stack([e.T_cam_target[:3, :3] for e in unaware if e.state.has_pose])
+    assert np.degrees(lie.angle_between(R[1:], R[:-1])).max() > 45, "it is this that makes it so"
+
+
+def test_the_variance_about_a_free_axis_is_that_of_a_full_turn():
+    scene = make_scene(40)
+    symmetry = Symmetry(axes=np.array([[0, 0, 1.0]]))
+    plain = _run(_stage(preset()), scene, range(40))[-1]
+    free = _run(FusionStage(preset(), PublishedFusion(preset()), symmetry), scene, range(40))[-1]
+    axis = free.T_cam_target[:3, 2]
+    added = (free.covariance - plain.covariance)[3:, 3:]
+    assert axis @ added @ axis == pytest.approx(FREE_VARIANCE_RAD2, rel=0.05)
+    across = np.cross(axis, [1.0, 0, 0])
+    assert abs(across @ added @ across) < 1e-2

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from hat_ros.config import HatConfig, KeyframeConfig
+from hat_ros.geometry import lie
+from hat_ros.geometry.symmetry import Symmetry, about_center
 from hat_ros.hypotheses import stage as hypothesis_stage
 from hat_ros.hypotheses.stage import HypothesisStage, box_overlap
 from hat_ros.types import Camera, Candidates, Detection, Frame, PosePrior
@@ -28,6 +30,7 @@ def _detection(left, right):
 
 def _asked(monkeypatch, detections, prior=None):
     monkeypatch.setattr(hypothesis_stage, "create_backend", lambda *_: _Backend())
+    monkeypatch.setattr(hypothesis_stage, "symmetry_of", lambda target: Symmetry())
     stage = HypothesisStage(HatConfig(keyframes=KeyframeConfig(gap_frames=6, settled_factor=3)), None)
     image = np.zeros((64, 64, 3), np.uint8)
     frames = [Frame(i + 1, image, CAMERA) for i in range(len(detections))]
@@ -66,3 +69,35 @@ def test_a_target_that_only_turns_a_little_is_not_tried_again(monkeypatch):
 def test_the_overlap_of_boxes(box, overlap):
     a, b = np.array([0.0, 0, 4, 4]), np.array(box, dtype=np.float64)
     assert box_overlap(a, b) == box_overlap(b, a) == pytest.approx(overlap)
+
+
+class _Turning:
+    """Candidates of a body with quarter turns: a new one of the four at every keyframe, and one that is no equal."""
+
+    def __init__(self):
+        self.calls = 0
+
+    def generate(self, frame, detection, prior):
+        turns = [[0, 0, self.calls * np.pi / 2], [0.6, 0, self.calls * np.pi / 2 + 0.3]]
+        self.calls += 1
+        T = lie.transform(lie.so3_exp(np.array(turns, float)), np.tile([0.0, 0, 5], (2, 1)))
+        return Candidates.from_matrices(T, np.array([0.0, -1.0]))
+
+    def reset(self):
+        pass
+
+
+@pytest.mark.parametrize("tracked", [False, True])
+def test_of_equal_orientations_the_one_nearest_to_the_track_is_given(monkeypatch, tracked):
+    """Without a track: nearest to the best of the last keyframe."""
+    quarters = about_center(lie.so3_exp(np.outer(np.arange(4) * np.pi / 2, [0, 0, 1.0])), np.zeros(3))
+    monkeypatch.setattr(hypothesis_stage, "create_backend", lambda *_: _Turning())
+    monkeypatch.setattr(hypothesis_stage, "symmetry_of", lambda target: Symmetry(quarters))
+    row = lie.row_from_matrix(lie.transform(lie.so3_exp(np.array([0, 0, 3.0])), np.array([0, 0, 5.0])))
+    prior = PosePrior(1, row, row, healthy=False, supported=True) if tracked else None
+    stage = HypothesisStage(HatConfig(keyframes=KeyframeConfig(gap_frames=1, settled_factor=1)), None)
+    image, mask = np.zeros((64, 64, 3), np.uint8), _detection(8, 40)
+    found = [stage.update(Frame(i + 1, image, CAMERA), mask, prior).T_cam_target for i in range(4)]
+    for best, other in found:
+        np.testing.assert_allclose(best[:3, :3], lie.so3_exp(np.array([0, 0, np.pi if tracked else 0.0])), atol=1e-12)
+        assert lie.angle_between(other[:3, :3], best[:3, :3]) < np.radians(46)

@@ -15,12 +15,15 @@ from hat_ros.array_types import Bool, Float, Int, UInt8
 from hat_ros.bench.campaign.draw import CampaignClip
 from hat_ros.bench.datasets.image_files import stamp_of
 from hat_ros.bench.evaluation import metrics
+from hat_ros.bench.evaluation.symmetric import nearest_truth
 from hat_ros.bench.methods.framewise import Hat
 from hat_ros.bench.synth.clips import render_clip, trajectory
 from hat_ros.bench.synth.mismatch import apply_mismatch
 from hat_ros.config import HatConfig
 from hat_ros.geometry import lie
 from hat_ros.geometry.masks import overlap
+from hat_ros.geometry.symmetry import Symmetry
+from hat_ros.target.exact_symmetry import symmetry_of
 from hat_ros.target.model import Target
 from hat_ros.tracker import StageWrapper
 from hat_ros.types import MASK_SILHOUETTE, Frame
@@ -51,8 +54,9 @@ class Played:
     """What came out of a clip, frame by frame; every computed pose counts, whatever is published.
 
     Attributes:
-        e_p: (N,) pose error, NaN without a pose.
-        rotation_deg: (N,) rotation error, NaN without a pose.
+        e_p: (N,) pose error to the nearest of the poses that look like the truth, NaN without a pose.
+        e_p_plain: (N,) pose error to the truth itself, as the paper has it.
+        rotation_deg: (N,) rotation error of the former kind, and so are those of the hypotheses.
         state: (N,) :class:`~hat_ros.types.TrackState` values.
         mask_iou: (N,) overlap of mask and true silhouette, 0 for a missing mask, NaN where the craft is too small.
         best_deg: (N,) rotation error of the best of ten hypotheses, NaN outside keyframes.
@@ -63,6 +67,7 @@ class Played:
     """
 
     e_p: Float
+    e_p_plain: Float
     rotation_deg: Float
     state: Int
     mask_iou: Float
@@ -111,17 +116,20 @@ def play_clip(film: Film, target: Target, config: HatConfig, masks_given: bool) 
     done = list(Pipeline(lambda wrap: Hat(config, target, clock.inside(wrap))).run(frames))
     estimates = [item.step.estimate for item in done]
     T_est = lie.matrix_from_row(np.array([estimate.pose_row for estimate in estimates]))
-    errors = metrics.pose_errors(T_est, film.T_true)
+    symmetry = symmetry_of(target)
+    T_equal = nearest_truth(T_est, film.T_true, symmetry)
+    errors = metrics.pose_errors(T_est, T_equal)
     covariance = np.array([estimate.covariance for estimate in estimates])
     judged = errors.scored & np.isfinite(covariance).all(axis=(-1, -2))
     inside = np.full(len(done), np.nan)
-    inside[judged] = metrics.inside_ellipsoid(T_est, covariance, film.T_true)
+    inside[judged] = metrics.inside_ellipsoid(T_est, covariance, T_equal)
     return Played(
         e_p=errors.pose,
+        e_p_plain=metrics.pose_errors(T_est, film.T_true).pose,
         rotation_deg=np.degrees(errors.rotation_rad),
         state=np.array([int(estimate.state) for estimate in estimates]),
         mask_iou=np.array(list(_overlaps(film, done))),
-        best_deg=_best_deg(done, film.T_true),
+        best_deg=_best_deg(done, film.T_true, symmetry),
         inside_95=inside,
         segmentation_ms=np.array(clock.ms),
         frame_ms=np.array([item.cpu_ms for item in done]),
@@ -175,8 +183,10 @@ def _longer_side_px(mask: Bool) -> int:
     return max(cv2.boundingRect(mask.view(np.uint8))[2:])
 
 
-def _best_deg(done: list[Processed], T_true: Float) -> Float:
+def _best_deg(done: list[Processed], T_true: Float, symmetry: Symmetry) -> Float:
     """Candidates come best first; those of a frame that is no keyframe are none."""
-    rows = [item.step.candidates.pose_rows[:BEST_OF] for item in done]
+    truth = T_true[:, :3, :3]
+    found = [item.step.candidates.nearest(symmetry, R) for item, R in zip(done, truth, strict=True)]
+    rows = [candidates.pose_rows[:BEST_OF] for candidates in found]
     best = metrics.best_of_k_deg(rows, T_true)
     return np.where([item.step.estimate.keyframe for item in done], best, np.nan)

@@ -36,7 +36,7 @@ from hat_ros.io.results import write_json
 
 CLIPS_FOLDER, KEPT_FOLDER = "clips", "kept"
 # Figures that are infinite where they were never reached; null in a file.
-NEVER = ("first_right", "first_tracking", "E_p_mean")
+NEVER = ("first_right", "first_tracking", "E_p_mean", "E_p_plain_mean")
 # One thread per worker: timings are comparable, and N jobs use N cores.
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 

@@ -34,6 +34,7 @@ def figures_of(played: Played) -> dict[str, Any]:
     return {
         "found": bool(mean < WRONG_E_P and coverage >= FOUND_COVERAGE),
         "E_p_mean": mean,
+        "E_p_plain_mean": float(np.mean(played.e_p_plain[scored])) if scored.any() else float("inf"),
         "coverage": coverage,
         "frames": len(e_p),
         "first_right": _first(right),
@@ -57,7 +58,8 @@ def figures_of(played: Played) -> dict[str, Any]:
 
 def figures_of_failure(frames: int) -> dict[str, Any]:
     """Figures of a clip that could not be played: not found, no pose, no mask."""
-    nothing = {"found": False, "E_p_mean": float("inf"), "coverage": 0.0, "frames": frames}
+    nothing = {"found": False, "coverage": 0.0, "frames": frames}
+    nothing |= {"E_p_mean": float("inf"), "E_p_plain_mean": float("inf")}
     never = {"first_right": float("inf"), "first_tracking": float("inf")}
     counts = dict.fromkeys(("tracking", "tracking_wrong", "tracking_far", "right", "right_tracking"), 0)
     # Each of its masks is missing, so each counts 0.

@@ -1,5 +1,6 @@
 """The BOP layout (YCB-Video): scenes with ``rgb``, ``mask_visib``, ``scene_gt.json`` and ``scene_camera.json``.
 
+    ROOT/models/models_info.json                 {"1": {"symmetries_discrete", "symmetries_continuous"}} mm, optional
     ROOT/test/000048/rgb/000001.png              ROOT/models/obj_000001.ply (millimetres)
     ROOT/test/000048/mask_visib/000001_000000.png   image, index of the entry in scene_gt
     ROOT/test/000048/scene_gt.json               {"1": [{"cam_R_m2c": [9], "cam_t_m2c": [3] mm, "obj_id"}]}
@@ -25,6 +26,7 @@ from hat_ros.bench.datasets.instances import follow_instances
 from hat_ros.bench.datasets.sequence import read_json
 from hat_ros.errors import DatasetError
 from hat_ros.geometry import lie
+from hat_ros.geometry.symmetry import Symmetry, symmetry_from_declaration
 
 MILLIMETRE = 1e-3
 TARGETS_FILE = "test_targets_bop19.json"
@@ -61,6 +63,7 @@ def open_bop(
             f"{split}: no scene folder with scene_gt.json; give the folder that holds 'test' and 'models'"
         )
     listed = _targets(root / TARGETS_FILE) if targets_only else None
+    symmetries = _symmetries(root / "models" / "models_info.json")
     for scene in scenes:
         gt, calibration = read_json(scene / "scene_gt.json"), read_json(scene / "scene_camera.json")
         for object_id in sorted(_objects(gt, scene) - set(without)):
@@ -76,7 +79,28 @@ def open_bop(
             for index, (name, entries) in enumerate(zip(names, instances, strict=True)):
                 if not sequences or {scene.name, whole, name} & set(sequences):
                     recording = read_scene(scene, name, mesh, gt, calibration, object_id, listed, entries=entries)
-                    yield replace(recording, scene=ids, instance=index if len(names) > 1 else None)
+                    instance = index if len(names) > 1 else None
+                    yield replace(recording, scene=ids, instance=instance, symmetry=symmetries.get(object_id))
+
+
+def _symmetries(path: Path) -> dict[int, Symmetry]:
+    """Object -> the symmetry that ``models_info.json`` declares; objects without one are left out.
+
+    Raises:
+        DatasetError: malformed.
+    """
+    if not path.is_file():
+        return {}
+    found, models = {}, read_json(path)
+    for key, info in models.items() if isinstance(models, dict) else ():
+        keys = ("symmetries_discrete", "symmetries_continuous")
+        if str(key).isdigit() and isinstance(info, dict) and set(keys) & set(info):
+            try:
+                discrete, continuous = (info.get(name, []) for name in keys)
+                found[int(key)] = symmetry_from_declaration(discrete, continuous, MILLIMETRE)
+            except ValueError as error:
+                raise DatasetError(f"{path}, object {key}: {error}") from None
+    return found
 
 
 def open_ycbv(root: Path, model: Path | None = None, sequences: Collection[str] = ()) -> Iterator[ImageRecording]:

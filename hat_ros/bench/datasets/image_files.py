@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,8 +16,11 @@ from numpy.typing import NDArray
 from hat_ros.array_types import Float, Float32, UInt8
 from hat_ros.errors import DatasetError, FrameError
 from hat_ros.geometry import lie
+from hat_ros.geometry.symmetry import Symmetry
 from hat_ros.io.compressed import check_pixels
 from hat_ros.io.value_range import ValueRange
+from hat_ros.target.loading import ModelFile, find_model, load_target
+from hat_ros.target.model import Target
 from hat_ros.types import Camera, Frame
 
 if TYPE_CHECKING:
@@ -64,6 +67,7 @@ class ImageRecording:
         scene: (scene, object) numbers of a BOP data set, by which detections of many are told apart.
         image_depth: option ``camera.image_depth``, for 16-bit files.
         instance: number among several instances of one object in one scene; None = it occurs once.
+        symmetry: what the data set declares of the target; None = what its ``target.yaml`` does.
     """
 
     name: str
@@ -77,9 +81,28 @@ class ImageRecording:
     mask_value: int | None = None
     image_depth: str = "auto"
     instance: int | None = None
+    symmetry: Symmetry | None = None
 
     def __len__(self) -> int:
         return len(self.files)
+
+    def model_file(self) -> ModelFile:
+        """The CAD file, its scale and symmetry.
+
+        Raises:
+            MeshError: it is missing or malformed.
+        """
+        model = find_model(self.target_path, self.unit_scale)
+        return model if self.symmetry is None else replace(model, symmetry=self.symmetry)
+
+    def load_target(self) -> Target:
+        """The CAD model.
+
+        Raises:
+            MeshError: it is unusable.
+        """
+        target = load_target(self.target_path, self.unit_scale)
+        return target if self.symmetry is None else replace(target, declared_symmetry=self.symmetry)
 
     def frames(self, limit: int | None = None, masks: bool = True, start: int = 0) -> Iterator[Frame]:
         """Decoded frames in order, with or without what is known of the target's place in them.

@@ -17,10 +17,10 @@ from hat_ros.array_types import UInt8
 from hat_ros.bench.datasets.detections import load_detections
 from hat_ros.bench.datasets.image_files import ImageFile, ImageRecording
 from hat_ros.errors import DatasetError, UsageError
+from hat_ros.geometry.symmetry import declaration_of
 from hat_ros.io import own_folder
 from hat_ros.io.bag_writer import BagWriter
 from hat_ros.io.provenance import input_hash
-from hat_ros.target.loading import find_model, load_target
 from hat_ros.target.mesh_file import companions_of
 from hat_ros.target.rendering import create_renderer
 from hat_ros.types import Frame
@@ -157,13 +157,14 @@ def _with_instance(recordings: Iterable[ImageRecording], number: int) -> list[Im
 
 def _made_from(fmt: str, recording: ImageRecording, boxes: bool, detections: Path | None) -> dict[str, Any]:
     """What decides a bag's content beside the data set's own images and labels."""
-    model = find_model(recording.target_path, recording.unit_scale)
+    model = recording.model_file()
     companions = companions_of(model.mesh)
     return {
         "format": fmt,
         "sequence": recording.name,
         "model_sha256": input_hash(model.mesh),
         **({"companions_sha256": {name: input_hash(path) for name, path in companions.items()}} if companions else {}),
+        **({"symmetry": declaration_of(model.symmetry)} if model.symmetry is not None else {}),
         # Where a target.yaml states a scale of its own.
         **({"unit_scale": model.unit_scale} if model.unit_scale != recording.unit_scale else {}),
         "boxes_from_labels": boxes,
@@ -196,7 +197,7 @@ def _complete(bag: Path, made_from: dict[str, Any]) -> bool:
 
 def _write_bag(recording: ImageRecording, bag: Path, made_from: dict[str, Any], progress: Progress | None) -> None:
     """Write beside the goal and rename, so that a bag under its own name is always complete."""
-    load_target(recording.target_path, recording.unit_scale)  # a bad CAD model is found before the long part
+    recording.load_target()  # a bad CAD model is found before the long part
     partial = bag.with_name(f"{bag.name}.partial")
     with own_folder.NewFolder(partial):
         _fill(recording, partial / bag.name, made_from, progress)
@@ -219,8 +220,8 @@ def _fill(recording: ImageRecording, bag: Path, made_from: dict[str, Any], progr
             )
             if progress is not None:
                 progress(recording.name, index + 1, len(recording))
-        model = find_model(recording.target_path, recording.unit_scale)
-        writer.write_target(model.mesh, model.unit_scale, recording.name)
+        model = recording.model_file()
+        writer.write_target(model.mesh, model.unit_scale, recording.name, model.symmetry)
         text = json.dumps(made_from, indent=2) + "\n"
         (bag / IMPORT_FILE).write_text(text, encoding="utf-8")
     own_folder.mark(bag)
@@ -238,7 +239,7 @@ def with_annotation_boxes(recording: ImageRecording) -> ImageRecording:
 
     They land in ``/detection/mask`` as filled boxes (128) and are used by ``segmentation.backend=annotated`` alone.
     """
-    vertices = load_target(recording.target_path, recording.unit_scale).vertices_m
+    vertices = recording.load_target().vertices_m
     files = []
     for item in recording.files:
         T = item.T_cam_target
@@ -301,7 +302,7 @@ def check_picture(recording: ImageRecording, width_px: int = 640) -> UInt8:
     labelled = [(item, T) for item in recording.files if (T := item.T_cam_target) is not None]
     if not labelled:
         raise DatasetError(f"{recording.name}: no frame has a ground truth, nothing to check")
-    renderer = create_renderer("rays", load_target(recording.target_path, recording.unit_scale))
+    renderer = create_renderer("rays", recording.load_target())
     columns = []
     for item, T_cam_target in (labelled[0], labelled[len(labelled) // 2], labelled[-1]):
         rgb = next(replace(recording, files=[item]).frames(masks=False)).rgb.copy()

@@ -14,6 +14,7 @@ import numpy as np
 
 from hat_ros.array_types import UInt8
 from hat_ros.bench.evaluation import figures
+from hat_ros.geometry.symmetry import known_up_to
 from hat_ros.io.run_log import RunLog
 from hat_ros.types import StateReason, TrackState
 
@@ -40,7 +41,13 @@ _FIGURES = (
     ("E_q_deg_mean", "E_q mean (deg)", ".3f"),
     ("E_q_deg_sd", "E_q SD (deg)", ".3f"),
     ("E_q_over_90_share", "E_q beyond 90 deg", ".1%"),
+    ("E_p_sym_mean", "E_p to the nearest equal orientation, mean", ".4f"),
+    ("E_q_sym_deg_mean", "E_q to the nearest equal orientation, mean (deg)", ".3f"),
     ("ADD_S_m_mean", "ADD-S mean (m)", ".4f"),
+    ("MSSD_m_mean", "MSSD mean (m)", ".4f"),
+    ("MSPD_px_mean", "MSPD mean (px)", ".2f"),
+    ("AR_MSSD", "BOP recall by MSSD", ".3f"),
+    ("AR_MSPD", "BOP recall by MSPD", ".3f"),
     ("keyframes", "keyframes", "d"),
     ("oracle_within_15_share", "best candidate within 15 deg", ".1%"),
     ("oracle_within_30_share", "best candidate within 30 deg", ".1%"),
@@ -79,6 +86,7 @@ def write_report(
     parts = [
         f"<h1>{html.escape(title)}</h1>",
         _figure_table(metrics),
+        _symmetry(metrics),
         _states(log),
         _refusals(metrics.get("refused_reasons", ())),
         "<h2>Over time</h2>",
@@ -123,6 +131,13 @@ def _figure_table(metrics: dict[str, Any]) -> str:
         if value is not None and np.isfinite(value):
             rows.append(f'<tr><td>{label}</td><td class="n">{value:{form}}</td></tr>')
     return f"<table>{''.join(rows)}</table>"
+
+
+def _symmetry(metrics: dict[str, Any]) -> str:
+    """How far poses of the target are known; nothing without a symmetry."""
+    words = known_up_to(metrics.get("symmetry_order", 1), metrics.get("symmetry_free_axes", 0))
+    note = "Errors over time, states, covariance and hypotheses are held against the equal orientation that is nearest."
+    return f'<p class="note">The target is symmetric: a pose is {words}. {note}</p>' if words else ""
 
 
 def _states(log: RunLog) -> str:

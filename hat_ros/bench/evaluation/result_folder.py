@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +19,17 @@ from hat_ros.bench.evaluation.figures import error_figure, image_bytes, range_fi
 from hat_ros.bench.evaluation.metrics import pose_errors
 from hat_ros.bench.evaluation.report import write_report
 from hat_ros.bench.evaluation.score import score_run
+from hat_ros.bench.evaluation.symmetric import errors_to_nearest, nearest_truth
 from hat_ros.bench.observations import save_observations
 from hat_ros.bench.source import Source, SourceSpec, open_source
 from hat_ros.config import CameraConfig, load_config
-from hat_ros.errors import BagError, ConfigError, HatError, RunError, UsageError
+from hat_ros.errors import BagError, ConfigError, FrameError, HatError, RunError, UsageError
+from hat_ros.geometry import lie
+from hat_ros.geometry.symmetry import Symmetry
 from hat_ros.io.result_bag import read_result_bag
 from hat_ros.io.results import BAG_FOLDER, CONFIG_FILE, METRICS_FILE, RUN_FILE, tum_line, write_json
 from hat_ros.io.run_log import RunLog
+from hat_ros.target.exact_symmetry import symmetry_of
 from hat_ros.types import Frame, StateReason, TrackState
 
 POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
@@ -39,6 +45,7 @@ CSV_COLUMNS = (
     "E_q_deg",
     "E_p",
     "reason",
+    "E_p_sym",
 )
 
 POSES_FILE = "poses.csv"
@@ -64,13 +71,13 @@ def complete_folder(folder: Path, source: Source | None, measured: dict[str, Any
     log = read_result_bag(folder / BAG_FOLDER)
     run = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
     figures = _score(log, source, run) | measured
-    write_tables(folder, log)
+    write_tables(folder, log, _symmetry(source))
     if run.get("mode") == "observe":
         save_observations(folder / OBSERVATIONS_FILE, log)
     write_json(folder / METRICS_FILE, figures)
     strip = paint_overlay(folder, source, log, video) if source and (video or report) else []
     if report:
-        _report(folder, log, figures, strip)
+        _report(folder, log, figures, strip, _symmetry(source))
 
 
 def evaluate_folder(
@@ -102,21 +109,26 @@ def evaluate_folder(
         if not log.has_truth.any():
             raise BagError(f"{truth} has no ground truth at any stamp of {folder}: is it the recording of this run?")
     figures |= _score(log, source, run)
-    write_tables(folder, log)
+    write_tables(folder, log, _symmetry(source))
     write_json(folder / METRICS_FILE, figures)
-    _report(folder, log, figures, paint_overlay(folder, source, log, video=False) if source else [])
+    _report(folder, log, figures, paint_overlay(folder, source, log, video=False) if source else [], _symmetry(source))
 
 
 def _score(log: RunLog, source: Source | None, run: dict[str, Any]) -> dict[str, Any]:
     """The figures of a run, with the frames that ``run.json`` says were played and refused."""
     target = source.target if source else None
-    figures = score_run(log, target, run.get("played"), run.get("refused", 0))
+    camera = None
+    if source is not None:
+        with suppress(BagError, FrameError):  # a recording that has no one calibration was scored without before
+            camera = source.recording.camera
+    figures = score_run(log, target, run.get("played"), run.get("refused", 0), camera)
     return figures | {"refused_reasons": run.get("refused_reasons", [])}
 
 
-def write_tables(path: Path, log: RunLog) -> None:
-    """``poses.tum`` and ``poses.csv`` of a finished run."""
+def write_tables(path: Path, log: RunLog, symmetry: Symmetry) -> None:
+    """``poses.tum`` and ``poses.csv`` of a finished run; ``symmetry`` is that of the target."""
     errors = pose_errors(log.T_est, log.T_true)
+    to_nearest = errors_to_nearest(log.T_est, log.T_true, symmetry)
     with (path / "poses.tum").open("w", encoding="utf-8", newline="") as tum:
         for i in map(int, np.flatnonzero(log.has_output)):
             tum.write(tum_line(int(log.stamp_ns[i]), log.pose_rows[i]))
@@ -136,15 +148,19 @@ def write_tables(path: Path, log: RunLog) -> None:
                     int(log.gap_frames[i]),
                     *_cells((errors.translation_m[i], np.degrees(errors.rotation_rad[i]), errors.pose[i])),
                     StateReason(int(log.reason[i])).name,
+                    *_cells((to_nearest.pose[i],)),
                 )
             )
 
 
 def read_errors(folder: Path) -> Float:
-    """(N, 3) E_t in metres, E_q in degrees, E_p of every frame, as :func:`write_tables` wrote them; NaN: none."""
+    """(N, 4) E_t in metres, E_q in degrees, E_p, E_p to the nearest equal of the truth; of every frame, NaN: none.
+
+    As :func:`write_tables` wrote them.
+    """
     with (folder / POSES_FILE).open(newline="", encoding="utf-8") as file:
-        rows = [[row[key] for key in ("E_t_m", "E_q_deg", "E_p")] for row in csv.DictReader(file)]
-    return np.array([[float(cell) if cell else np.nan for cell in row] for row in rows]).reshape(-1, 3)
+        rows = [[row.get(key) for key in ("E_t_m", "E_q_deg", "E_p", "E_p_sym")] for row in csv.DictReader(file)]
+    return np.array([[float(cell) if cell else np.nan for cell in row] for row in rows]).reshape(-1, 4)
 
 
 def plot_folder(folder: Path, out: Path, form: str) -> list[Path]:
@@ -204,8 +220,17 @@ def _source_of(run: dict[str, Any], folder: Path) -> Source | None:
         return None
 
 
-def _report(folder: Path, log: RunLog, figures: dict[str, Any], strip: list[tuple[str, UInt8]]) -> None:
+def _symmetry(source: Source | None) -> Symmetry:
+    """Of the target; none where the recording is no longer there."""
+    return Symmetry() if source is None else symmetry_of(source.target)
+
+
+def _report(
+    folder: Path, log: RunLog, figures: dict[str, Any], strip: list[tuple[str, UInt8]], symmetry: Symmetry
+) -> None:
     run, _, config_text = read_folder(folder)
+    if not symmetry.is_trivial:
+        log = replace(log, truth_rows=lie.row_from_matrix(nearest_truth(log.T_est, log.T_true, symmetry)))
     title = f"{Path(run['source']).name}: {run.get('mode', 'hat')}"
     write_report(folder / "report.html", title, log, figures, run, config_text, strip)
 

@@ -39,6 +39,9 @@ _FIGURES = (
     Column("E_q_deg_mean", "E_q deg", ".2f", r"$E_q$ ($^\circ$)"),
     Column("E_q_deg_sd", "SD", ".2f"),
     Column("E_q_over_90_share", ">90", ".1%"),
+    Column("E_p_sym_mean", "E_p sym", ".4f", r"$E_p^{\mathrm{sym}}$"),
+    Column("MSSD_m_mean", "MSSD m", ".4f"),
+    Column("MSPD_px_mean", "MSPD px", ".2f"),
     Column("coverage", "cover", ".1%"),
     Column("oracle_within_15_share", "best<15", ".1%"),
     Column("oracle_within_30_share", "best<30", ".1%"),
@@ -256,6 +259,7 @@ _POOLED = {
     "E_q_deg_mean",
     "E_q_deg_sd",
     "E_q_over_90_share",
+    "E_p_sym_mean",
     "coverage",
     "fps",
 }
@@ -269,6 +273,7 @@ def _pooled(runs: Sequence[tuple[Path, dict[str, Any]]]) -> dict[str, Any]:
     frames = sum(figures["frames"] for _, figures in runs if figures.get("fps"))
     return {
         **metrics.summarise(metrics.PoseErrors(errors[:, 0], np.radians(errors[:, 1]), errors[:, 2])),
+        "E_p_sym_mean": float(np.nanmean(errors[:, 3])) if np.isfinite(errors[:, 3]).any() else float("nan"),
         "clips": len(runs),
         "targets": targets,
         "coverage": sum(figures["valid"] for _, figures in runs) / targets if targets else None,

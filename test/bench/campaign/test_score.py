@@ -15,6 +15,7 @@ def played(e_p, **more):
     n = len(e_p)
     series = {
         "e_p": np.array(e_p, dtype=float),
+        "e_p_plain": np.array(e_p, dtype=float) + 2.0,
         "rotation_deg": np.degrees(np.array(e_p, dtype=float)) / 2,
         "state": np.full(n, int(TRACKING)),
         "mask_iou": np.ones(n),
@@ -67,6 +68,12 @@ def test_overlaps_hypotheses_and_ellipsoids():
     assert (figures["keyframes"], figures["best_within"]) == (2, 1)
     assert (figures["ellipsoids"], figures["inside_95"]) == (2, 1)
     assert figures["segmentation_ms_mean"] == 1.5
+
+
+def test_the_error_to_the_nearest_equal_decides_and_the_plain_one_stands_beside_it():
+    figures = figures_of(played([0.05] * 9 + [NAN]))
+    assert figures["found"]
+    assert (figures["E_p_mean"], figures["E_p_plain_mean"]) == (pytest.approx(0.05), pytest.approx(2.05))
 
 
 def test_a_clip_without_any_pose():

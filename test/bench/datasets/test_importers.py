@@ -22,9 +22,11 @@ from hat_ros.bench.datasets.importer import (
     with_annotation_boxes,
 )
 from hat_ros.bench.datasets.sequence import load_sequence, write_labels
+from hat_ros.bench.source import SourceSpec
 from hat_ros.errors import BagError, DatasetError, MeshError, UsageError
 from hat_ros.geometry import lie
 from hat_ros.io.bag_reader import BagReader
+from hat_ros.target.exact_symmetry import symmetry_of
 from hat_ros.target.loading import load_target
 from hat_ros.types import Camera
 
@@ -384,6 +386,33 @@ def test_swisscube_folders(tmp_path):
 
 
 # ---------------------------------------------------------------- bop
+
+
+HALF_TURN_MM = [-1, 0, 0, 100, 0, -1, 0, 60, 0, 0, 1, 0, 0, 0, 0, 1]
+
+
+def test_bop_symmetries_in_millimetres_become_metres_in_the_bag(bop_root, tmp_path):
+    info = {"2": {"diameter": 120, "symmetries_discrete": [HALF_TURN_MM]}, "5": {"diameter": 120}}
+    (bop_root / "models" / "models_info.json").write_text(json.dumps(info))
+    bags = {bag.name: bag for bag in import_dataset("bop", bop_root, tmp_path / "bags")}
+    target = load_target(BagReader(bags["000048_obj2"]).target_path)
+    np.testing.assert_allclose(symmetry_of(target).turns[1][:3, 3], [0.1, 0.06, 0.0])
+    assert load_target(BagReader(bags["000048_obj5"]).target_path).declared_symmetry is None
+    spec = SourceSpec(bop_root, "bop", "000048_obj2")
+    np.testing.assert_array_equal(symmetry_of(spec.open().target).turns, symmetry_of(target).turns)
+    stamp = bags["000048_obj2"].stat().st_mtime_ns
+    import_dataset("bop", bop_root, tmp_path / "bags")
+    assert bags["000048_obj2"].stat().st_mtime_ns == stamp, "complete: left alone"
+    (bop_root / "models" / "models_info.json").write_text(json.dumps({"2": {"symmetries_discrete": []}}))
+    import_dataset("bop", bop_root, tmp_path / "bags")
+    assert symmetry_of(load_target(BagReader(bags["000048_obj2"]).target_path)).is_trivial
+
+
+def test_a_bop_symmetry_that_is_none_is_one_sentence(bop_root):
+    info = {"2": {"symmetries_continuous": [{"axis": [0, 0, 1]}]}}
+    (bop_root / "models" / "models_info.json").write_text(json.dumps(info))
+    with pytest.raises(DatasetError, match=r"models_info.json, object 2: symmetries_continuous\[0\] must have 'axis'"):
+        list(open_dataset("bop", bop_root))
 
 
 def test_bop_gives_one_recording_per_object_with_its_own_mask(bop_root):
