@@ -81,6 +81,7 @@ class PoseRefiner(Protocol):
 BACKENDS: dict[str, dict[str, str]] = {
     "segmentation": {
         "classical": "hat_ros.segmentation.classical:ClassicalSegmenter",
+        "learned": "hat_ros.segmentation.learned:LearnedSegmenter",
         "annotated": "hat_ros.segmentation.annotated:AnnotatedSegmenter",
         "mask2former": "hat_ros.segmentation.mask2former:Mask2FormerSegmenter",
     },

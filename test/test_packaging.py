@@ -89,7 +89,7 @@ def test_every_declared_package_is_imported():
 def test_pins_lie_within_the_bounds():
     pins = requirements("requirements.txt", "requirements-nets.txt", "requirements-test.txt")
     stated = PROJECT["dependencies"] + [
-        text for extra in ("ros", "nets") for text in PROJECT["optional-dependencies"][extra]
+        text for extra in ("ros", "nets", "train") for text in PROJECT["optional-dependencies"][extra]
     ]
     for need in map(Requirement, stated):
         (pin,) = pins[canonicalize_name(need.name)].specifier
@@ -148,6 +148,7 @@ def test_doctor_asks_for_every_dependency():
     [
         ("rclpy", ["replay", "bags/demo"], "pip install 'hat_ros[ros]'"),
         ("torch", ["track", "bags/demo", "--config", "pico_hat"], "pip install 'hat_ros[nets]'"),
+        ("torch", ["train", "segmenter"], "pip install 'hat_ros[train]'"),
         ("numba", ["track", "bags/demo"], "'numba' is missing: run `make install`"),
     ],
 )

@@ -40,7 +40,7 @@ BENCH_FLOORS = (
     ("methods",),
     ("runs",),
     ("experiments",),
-    ("campaign",),
+    ("campaign", "training"),
 )
 BENCH_FLOOR = {room: number for number, rooms in enumerate(BENCH_FLOORS) for room in rooms}
 

@@ -89,6 +89,7 @@ from hat_ros.config import preset_names
 package = files("hat_ros")
 assert not str(package).startswith(sys.argv[1]), f"{package} is the checkout"
 assert (package / "py.typed").is_file()
+assert (package / "segmentation" / "segmenter.onnx").is_file()
 assert set(preset_names()) >= {"default", "mega_hat", "pico_hat"}, preset_names()
 for name in preset_names():
     load_config(name)

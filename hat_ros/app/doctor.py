@@ -33,7 +33,7 @@ _REQUIRED = {
     "matplotlib": "matplotlib",
     "PIL": "pillow",
 }
-_OPTIONAL = {"torch": "nets", "transformers": "nets", "safetensors": "nets", "pyrender": "gl"}
+_OPTIONAL = {"torch": "nets", "transformers": "nets", "safetensors": "nets", "onnx": "train", "pyrender": "gl"}
 # Packages whose releases have broken this one before -> oldest and newest version that the tests run with.
 TESTED = {
     "numba": ("0.59.0", "0.68.1"),

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from types import FrameType
 
 from hat_ros import __version__
-from hat_ros.cli import analyse, bench, campaign, check, config, data, run, system
+from hat_ros.cli import analyse, bench, campaign, check, config, data, run, system, train
 from hat_ros.errors import HatError, InputError, RunError
 
 EXIT_INTERRUPTED = 130
@@ -44,7 +44,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for group in (run, data, check, analyse, bench, campaign, config, system):
+    for group in (run, data, check, analyse, bench, campaign, train, config, system):
         group.add_commands(commands)
     return parser
 

@@ -22,6 +22,18 @@ class ClassicalConfig:
 
 
 @dataclass(frozen=True)
+class LearnedConfig:
+    """Segmentation by a small network."""
+
+    weights: str = option(
+        "", "ONNX file from `hat train segmenter`; empty: the network that comes with the package", level="basic"
+    )
+    min_shape_overlap: float = option(
+        0.35, "overlap with the nearest CAD silhouette that a mask found from nothing needs", low=0, high=1
+    )
+
+
+@dataclass(frozen=True)
 class Mask2FormerConfig:
     """COCO instance segmentation with a class-agnostic choice."""
 
@@ -34,12 +46,13 @@ class Mask2FormerConfig:
 class SegmentationConfig:
     """Stage 1."""
 
-    backend: str = option("classical", "classical, annotated or mask2former", level="basic")
+    backend: str = option("classical", "classical, learned, annotated or mask2former", level="basic")
     box_padding: float = option(
         0.0, "share of width/height added on each side of a given box", level="basic", low=0, high=1
     )
     min_area_px: int = option(60, "smallest mask that counts as a detection", level="basic", unit="px", low=1)
     classical: ClassicalConfig = field(default_factory=ClassicalConfig)
+    learned: LearnedConfig = field(default_factory=LearnedConfig)
     mask2former: Mask2FormerConfig = field(default_factory=Mask2FormerConfig)
 
 

@@ -45,6 +45,11 @@ def _version(package: str) -> str | None:
         return None
 
 
+def package_versions(*names: str) -> dict[str, str]:
+    """Name -> version of those packages that are installed."""
+    return {name: version for name in names if (version := _version(name))}
+
+
 def config_hash(config: HatConfig) -> str:
     """SHA-256 of the configuration's values, independent of how they were given."""
     return hashlib.sha256(json.dumps(config_to_dict(config), sort_keys=True).encode()).hexdigest()
@@ -71,7 +76,7 @@ def describe_run(source: Path, source_sha256: str, config: HatConfig, **more: An
         "code": code_version(),
         "code_sha256": code_hash(),
         "python": platform.python_version(),
-        "packages": {name: version for name in _PACKAGES if (version := _version(name))},
+        "packages": package_versions(*_PACKAGES),
         "machine": f"{platform.system()} {platform.machine()}",
         "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
         **more,

@@ -25,7 +25,7 @@ from hat_ros.io.bag_writer import BagWriter
 
 COMMANDS = (
     *("replay", "track", "temporal", "import", "synth", "evaluate", "plot", "score", "bench", "ablate", "config"),
-    *("weights", "doctor", "profile", "check", "campaign", "prepare"),
+    *("weights", "doctor", "profile", "check", "campaign", "train", "prepare"),
 )
 
 

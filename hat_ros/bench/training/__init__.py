@@ -1,0 +1,1 @@
+"""Training of the networks that the package ships: data rendered from a seed, fit, calibration, model card."""
