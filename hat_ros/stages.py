@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from importlib import import_module
-from typing import Literal, Protocol, overload
+from typing import Literal, Protocol, overload, runtime_checkable
 
 from hat_ros.array_types import Float
 from hat_ros.config import HatConfig
@@ -53,8 +53,12 @@ class MotionEstimator(Protocol):
         ...
 
 
+@runtime_checkable
 class PoseRefiner(Protocol):
-    """Measures a pose on one image by moving it to the nearest optimum; used by Stage 4."""
+    """Measures a pose on one image by moving it to the nearest optimum; used by Stage 4.
+
+    A hypothesis backend with a refiner of its own is one: the methods that follow or refine poses then use that.
+    """
 
     def refine(
         self, frame: Frame, detection: Detection | None, T_cam_target: Float, prior: RotationPrior | None = None

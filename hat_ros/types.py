@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from hat_ros.array_types import Bool, Float, UInt8
+from hat_ros.array_types import Bool, Float, Int, UInt8
 from hat_ros.errors import CandidateError, FrameError
 from hat_ros.geometry import lie
 from hat_ros.geometry.symmetry import Symmetry
@@ -85,12 +85,14 @@ class Frame:
         camera: calibration of this image.
         given_mask: (H, W) uint8 detection that came with the image, 255 = target silhouette, 128 = inside a box
             whose silhouette is unknown, 0 = outside; None when the recording brings none.
+        scored: a pose is asked for; False: the frame only feeds motion, as a data set's protocol may want it.
     """
 
     stamp_ns: int
     rgb: UInt8
     camera: Camera
     given_mask: UInt8 | None = None
+    scored: bool = True
 
     def __post_init__(self) -> None:
         shape = (self.camera.height, self.camera.width, 3)
@@ -164,18 +166,25 @@ class Candidates:
         pose_rows: (K, 7) ``T_cam_target``.
         log_score: (K,) appearance score, higher is better; ``-inf`` marks a dropped candidate that keeps its slot.
         box_xyxy: (4,) detection box in pixels, NaN when there is no detection.
+        rank: (K,) place among what the estimator chose from before it refined and scored again, from 0; given none,
+            the order of the candidates. With a smaller K it would have refined those of lower rank alone.
     """
 
     pose_rows: Float
     log_score: Float
     box_xyxy: Float = field(default_factory=lambda: np.full(4, np.nan))
+    rank: Int = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def __post_init__(self) -> None:
+        if not len(self.rank):
+            object.__setattr__(self, "rank", np.arange(len(self.log_score)))
         if self.pose_rows.ndim != 2 or self.pose_rows.shape[1] != 7 or self.log_score.shape != self.pose_rows.shape[:1]:
             raise CandidateError(
                 f"candidates need pose_rows (K, 7) and log_score (K,), found {self.pose_rows.shape} and "
                 f"{self.log_score.shape}"
             )
+        if self.rank.shape != self.log_score.shape:
+            raise CandidateError(f"candidates need rank ({len(self.log_score)},), found {self.rank.shape}")
 
     @classmethod
     def none(cls) -> Candidates:
@@ -183,15 +192,25 @@ class Candidates:
         return cls(np.zeros((0, 7)), np.zeros(0))
 
     @classmethod
-    def from_matrices(cls, T_cam_target: Float, log_score: Float, box_xyxy: Float | None = None) -> Candidates:
-        """Candidates from (K, 4, 4) poses and (K,) scores, sorted best first (stable)."""
+    def from_matrices(
+        cls, T_cam_target: Float, log_score: Float, box_xyxy: Float | None = None, rank: Int | None = None
+    ) -> Candidates:
+        """Candidates from (K, 4, 4) poses, (K,) scores and ranks, sorted best score first (stable)."""
         log_score = np.asarray(log_score, dtype=np.float64)
         order = np.argsort(-log_score, kind="stable")
         rows = lie.row_from_matrix(np.asarray(T_cam_target, dtype=np.float64).reshape(-1, 4, 4))[order]
-        return cls(rows, log_score[order], np.full(4, np.nan) if box_xyxy is None else np.asarray(box_xyxy, float))
+        box_xyxy = np.full(4, np.nan) if box_xyxy is None else np.asarray(box_xyxy, float)
+        return cls(rows, log_score[order], box_xyxy, np.arange(len(order)) if rank is None else rank[order])
 
     def __len__(self) -> int:
         return len(self.log_score)
+
+    def first(self, k: int) -> Candidates:
+        """What the estimator would have given for K = k."""
+        if len(self) <= k and self.rank.max(initial=-1) < k:
+            return self
+        keep = self.rank < k
+        return Candidates(self.pose_rows[keep], self.log_score[keep], self.box_xyxy, self.rank[keep])
 
     @cached_property
     def T_cam_target(self) -> Float:

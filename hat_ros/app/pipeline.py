@@ -91,6 +91,11 @@ class Pipeline:
         self.refusals = Refusals()
 
     @property
+    def credits(self) -> int:
+        """Frames in flight at once."""
+        return self._credits
+
+    @property
     def causal(self) -> bool:
         """Whether every step is final."""
         return self._method.causal

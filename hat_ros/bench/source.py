@@ -14,6 +14,7 @@ import numpy as np
 from hat_ros.array_types import Float, UInt8
 from hat_ros.bench.datasets.image_files import ImageRecording
 from hat_ros.bench.datasets.importer import open_dataset, with_annotation_boxes, with_detections
+from hat_ros.bench.datasets.protocols import NONE, protocol_of
 from hat_ros.bench.datasets.sequence import load_sequence
 from hat_ros.config import CameraConfig
 from hat_ros.errors import BagError, DatasetError, FrameError, UsageError
@@ -39,6 +40,7 @@ class SourceSpec:
         detections: masks or boxes of this sequence computed elsewhere, see ``datasets.importer.with_detections``.
         image_topic: topic of the images in a bag; None = find it.
         camera_info_topic: topic of the calibration in a bag; None = find it.
+        published: read the data set by its published protocol (:mod:`hat_ros.bench.datasets.protocols`).
     """
 
     path: Path
@@ -48,6 +50,7 @@ class SourceSpec:
     detections: Path | None = None
     image_topic: str | None = None
     camera_info_topic: str | None = None
+    published: bool = False
 
     @property
     def name(self) -> str:
@@ -65,6 +68,8 @@ class SourceSpec:
             return self._with_detections(input_hash(self.path))
         recording = self._in_dataset()
         digest = hashlib.sha256(recording.camera.K.tobytes() + recording.distortion.tobytes())
+        if recording.targets_only:
+            digest.update(b"targets only")
         for item in recording.files:
             truth = b"" if item.T_cam_target is None else item.T_cam_target.tobytes()
             box = b"" if item.box_xyxy is None else np.asarray(item.box_xyxy, dtype=np.float64).tobytes()
@@ -91,6 +96,7 @@ class SourceSpec:
             "detections_sha256": None if self.detections is None else input_hash(self.detections),
             "image_topic": self.image_topic,
             "camera_info_topic": self.camera_info_topic,
+            "protocol": "published" if self.published else "none",
         }
 
     def open(self, camera_config: CameraConfig | None = None) -> Source:
@@ -114,11 +120,13 @@ class SourceSpec:
         )
 
     def _in_dataset(self) -> ImageRecording:
+        protocol = protocol_of(self.dataset) if self.published else NONE
         for recording in open_dataset(self.dataset, self.path, self.model, (self.sequence,)):
+            recording = protocol.read(recording)
             if self.detections is not None:
                 return with_detections(recording, self.detections)
             # SHIRT has neither masks nor a published detector: the paper takes the regions from the labels.
-            return with_annotation_boxes(recording) if self.dataset == "shirt" else recording
+            return with_annotation_boxes(recording, protocol.corner_boxes) if self.dataset == "shirt" else recording
         raise DatasetError(f"{self.path}: no sequence named {self.sequence}")
 
 
@@ -130,14 +138,19 @@ class Source:
     recording: ImageRecording | BagReader
     target: Target
 
-    def frames(self, start: int = 0, limit: int | None = None, masks: bool = True) -> Iterator[Frame | FrameError]:
+    def frames(
+        self, start: int = 0, limit: int | None = None, masks: bool = True, scored_only: bool = False
+    ) -> Iterator[Frame | FrameError]:
         """Frames from number ``start`` on, at most ``limit`` of them; a malformed one comes as its error.
 
-        ``masks``: with the recorded ones.
+        ``masks``: with the recorded ones. ``scored_only``: those alone of these at which a pose is asked for.
         """
         stop, recording = None if limit is None else start + limit, self.recording
         if isinstance(recording, BagReader):
             return _attempts(recording, islice(recording.packets(), start, stop), masks)
+        if scored_only and recording.targets_only:
+            files = [item for item in recording.files[start:stop] if recording.is_scored(item)]
+            return replace(recording, files=files).frames(masks=masks)
         return recording.frames(stop, masks, start)
 
     def frames_at(self, numbers: Collection[int]) -> Iterator[Frame | FrameError]:

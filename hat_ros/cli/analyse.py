@@ -5,7 +5,17 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hat_ros.cli.options import Commands, add_camera, add_dataset, add_extent, add_out, add_topics, extent_of, spec_of
+from hat_ros.cli.options import (
+    Commands,
+    add_camera,
+    add_dataset,
+    add_extent,
+    add_out,
+    add_protocol,
+    add_topics,
+    extent_of,
+    spec_of,
+)
 
 
 def add_commands(commands: Commands) -> None:
@@ -82,6 +92,7 @@ def _add_score(commands: Commands) -> None:
     add_camera(parser)
     parser.add_argument("--fps", type=float, metavar="X", help="its frame rate, if you measured it")
     add_dataset(parser)
+    add_protocol(parser, "none")
     add_topics(parser)
     parser.add_argument("--sequence", default="", metavar="NAME", help="which sequence of the data set")
     add_out(parser, "result folder to write")

@@ -38,6 +38,13 @@ def add_overrides(parser: argparse.ArgumentParser) -> None:
         metavar="KEY=VALUE",
         help="override one value, e.g. --set keyframes.gap_frames=4 (may be repeated)",
     )
+    parser.add_argument(
+        "--allow-unverified",
+        dest="overrides",
+        action="append_const",
+        const="nets.allow_unverified=true",
+        help="take network weights of another checksum than the published one",
+    )
 
 
 def add_camera(parser: argparse.ArgumentParser) -> None:
@@ -84,7 +91,7 @@ def config_of(arguments: argparse.Namespace) -> HatConfig:
     """The configuration that ``--config`` and ``--set`` ask for."""
     from hat_ros.config import load_config
 
-    return load_config(arguments.config, arguments.overrides)
+    return load_config(arguments.config, (*protocol_settings(arguments), *arguments.overrides))
 
 
 def add_out(parser: argparse.ArgumentParser, what: str) -> None:
@@ -116,6 +123,26 @@ def add_dataset(parser: argparse.ArgumentParser, what: str = "the recording is a
         metavar="PATH",
         help="masks or boxes computed elsewhere, for --set segmentation.backend=annotated; see `hat import --help`",
     )
+
+
+def add_protocol(parser: argparse.ArgumentParser, default: str) -> None:
+    """``--protocol``: whether a data set is read and scored as the authors' benchmark does."""
+    parser.add_argument(
+        "--protocol",
+        choices=("published", "none"),
+        default=default,
+        help="published: read and run the --dataset as the authors' benchmark does (split, regions, targets; see the "
+        f"page Benchmark); --set overrides its settings (default: {default})",
+    )
+
+
+def protocol_settings(arguments: argparse.Namespace) -> tuple[str, ...]:
+    """What the published protocol sets, ``key=value``; empty without one."""
+    if getattr(arguments, "protocol", "none") == "none" or not arguments.dataset:
+        return ()
+    from hat_ros.bench.datasets.protocols import protocol_of
+
+    return protocol_of(arguments.dataset).settings
 
 
 def add_unit_scale(parser: argparse._ActionsContainer, whose: str) -> None:
@@ -166,6 +193,7 @@ def spec_of(arguments: argparse.Namespace) -> SourceSpec:
         arguments.detections,
         arguments.image_topic,
         arguments.camera_info_topic,
+        getattr(arguments, "protocol", "none") == "published",
     )
 
 

@@ -13,6 +13,7 @@ from hat_ros.cli.options import (
     add_dataset,
     add_extent,
     add_out,
+    add_protocol,
     add_threads,
     add_topics,
     config_of,
@@ -102,6 +103,7 @@ def _add_track(commands: Commands) -> None:
     )
     parser.add_argument("recording", type=Path, help="bag, folder of the `sequence` layout, or root of a data set")
     add_dataset(parser)
+    add_protocol(parser, "none")
     parser.add_argument("--sequence", default="", metavar="NAME", help="which sequence of the data set")
     add_out(parser, "result folder to write")
     add_config(parser)

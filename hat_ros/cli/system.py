@@ -44,6 +44,9 @@ def _add_weights(commands: Commands) -> None:
     parser.add_argument("name", nargs="?", help="one checkpoint (default: all)")
     parser.add_argument("--weights", type=Path, metavar="DIR", help="weights folder (default: $HAT_WEIGHTS)")
     parser.add_argument("--source", type=Path, metavar="FILE", help="convert: the pickled file, if it lies elsewhere")
+    parser.add_argument(
+        "--allow-unverified", action="store_true", help="check, convert: take another checksum than the published one"
+    )
     parser.set_defaults(command=_weights)
 
 
@@ -59,12 +62,12 @@ def _weights(arguments: argparse.Namespace) -> int:
     if arguments.action == "convert":
         if not arguments.name:
             raise UsageError("weights convert: name the checkpoint, `hat weights list` shows them")
-        print(checkpoint.convert(arguments.name, arguments.source, arguments.weights))
+        print(checkpoint.convert(arguments.name, arguments.source, arguments.weights, arguments.allow_unverified))
         return 0
     if arguments.action == "check":
         from hat_ros.nets.checkpoint_check import check
 
-        found = [check(name, arguments.weights) for name in names]
+        found = [check(name, arguments.weights, arguments.allow_unverified) for name in names]
         for status in found:
             name = status.checkpoint.name
             verdict = "ok" if status.usable else "missing" if status.path is None else "unusable"

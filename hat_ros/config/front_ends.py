@@ -48,7 +48,13 @@ class SegmentationConfig:
 
     backend: str = option("classical", "classical, learned, annotated or mask2former", level="basic")
     box_padding: float = option(
-        0.0, "share of width/height added on each side of a given box", level="basic", low=0, high=1
+        0.0, "share of width/height added on each side of a given box, or pose_region's", level="basic", low=0, high=1
+    )
+    pose_region: str = option(
+        "detection",
+        "what hypotheses see of a silhouette: detection (all of it), or box (its box alone, padded by box_padding)",
+        level="paper",
+        choices=("detection", "box"),
     )
     min_area_px: int = option(60, "smallest mask that counts as a detection", level="basic", unit="px", low=1)
     classical: ClassicalConfig = field(default_factory=ClassicalConfig)
@@ -76,7 +82,7 @@ class MegaPoseConfig:
 
     refiner_iterations: int = option(5, "render-and-compare iterations per candidate", level="paper", low=0, high=50)
     box_padding: float = option(
-        0.2, "share of width/height added on each side of the detection box", level="paper", low=0, high=1
+        0.1, "share of width/height added on each side of the detection box", level="paper", low=0, high=1
     )
     batch_size: int = option(64, "images per network pass; memory against speed", level="basic", low=1, high=4096)
 

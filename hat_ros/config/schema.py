@@ -29,7 +29,11 @@ from hat_ros.errors import ConfigError
 class NetsConfig:
     """Where and how the learned backends run."""
 
-    device: str = option("auto", "auto (cuda if there is one), cpu, cuda or cuda:N", level="basic")
+    device: str = option(
+        "auto",
+        "auto (cuda if there is one), cpu, cuda or cuda:N; single networks elsewhere: auto,droid=cuda:1",
+        level="basic",
+    )
     precision: str = option(
         "auto",
         "precision on cuda: auto (as released: DROID float16, others float32), float32, float16 or bfloat16",
@@ -39,6 +43,7 @@ class NetsConfig:
     weights_folder: str = option(
         "", "folder of the checkpoints; empty: HAT_WEIGHTS, else the user's data folder", level="basic"
     )
+    allow_unverified: bool = option(False, "take checkpoints of another checksum than the published one", level="basic")
 
 
 @dataclass(frozen=True)

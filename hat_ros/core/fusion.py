@@ -105,7 +105,20 @@ class FusionStage:
         self._margin = float("nan")
 
     def update(self, frame: Frame, detection: Detection | None, motion: Motion, selection: Selection) -> Estimate:
-        """Estimate the pose of one frame; arguments as for :meth:`FusionMethod.update`."""
+        """Estimate the pose of one frame; arguments as for :meth:`FusionMethod.update`.
+
+        A frame that is not scored has no pose, and nothing advances: intervals count the others.
+        """
+        if not frame.scored:
+            return Estimate(
+                frame.stamp_ns,
+                TrackState.UNINITIALISED,
+                _NO_POSE,
+                _NO_COVARIANCE,
+                slam_epoch=motion.epoch,
+                n_resets=self._n_resets,
+                reason=StateReason.NOT_FOUND,
+            )
         selection = self._one_of_equals(selection, motion)
         fused = self._method.update(frame, detection, motion, selection)
         self._n_resets += fused.reset

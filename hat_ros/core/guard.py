@@ -57,7 +57,7 @@ def guard_candidates(candidates: Candidates, drop: bool) -> Candidates:
         median_m = np.median(depth_m[keep])
         keep &= (depth_m >= median_m / MAX_DEPTH_RATIO) & (depth_m <= median_m * MAX_DEPTH_RATIO)
     rows = np.where(valid_pose[:, None], candidates.pose_rows, np.array([0.0, 0, 0, 0, 0, 0, 1]))
-    return Candidates(rows, np.where(keep, candidates.log_score, -np.inf), candidates.box_xyxy)
+    return Candidates(rows, np.where(keep, candidates.log_score, -np.inf), candidates.box_xyxy, candidates.rank)
 
 
 def _rigid_rows(pose_rows: Float) -> Bool:

@@ -20,7 +20,7 @@ from hat_ros.nets import picopose as pp
 from hat_ros.nets.checkpoint import load_into, load_state
 from hat_ros.target.model import Target
 from hat_ros.target.network_views import NetworkViewRenderer
-from hat_ros.types import Candidates, Detection, Frame, PosePrior
+from hat_ros.types import Candidates, Detection, Frame, PosePrior, Refined, RotationPrior
 
 LOG = logging.getLogger(__name__)
 
@@ -35,11 +35,11 @@ class GigaPoseHypotheses:
     """
 
     def __init__(self, config: HatConfig, target: Target) -> None:
-        self._megapose = MegaPose(config, target)
+        self._megapose = MegaPose(config, target, "gigapose")
         self._runtime = self._megapose.runtime
         self._n_candidates = config.hypotheses.max_candidates
         self._batch_size = config.hypotheses.picopose.batch_size
-        state = load_state("gigapose", config.nets.weights_folder or None)
+        state = load_state("gigapose", config.nets.weights_folder, config.nets.allow_unverified)
         self._net = gp.GigaPoseNet()
         load_into(self._net, state, "gigapose")
         self._runtime.place(self._net)
@@ -87,6 +87,12 @@ class GigaPoseHypotheses:
         K = tensor(frame.camera.K)
         T = pp.affine_pose(affine, tensor(M), K, bank["T_cam_target"][best], bank["M"][best], tensor(TEMPLATE_K))
         return self._megapose.candidates(self._runtime.image(frame.rgb), K, T, detection)
+
+    def refine(
+        self, frame: Frame, detection: Detection | None, T_cam_target: Float, prior: RotationPrior | None = None
+    ) -> Refined | None:
+        """By MegaPose, see :class:`~hat_ros.stages.PoseRefiner`; the prior is not used."""
+        return self._megapose.refined(frame, detection, T_cam_target)
 
     def reset(self) -> None:
         """Nothing is learned from earlier frames."""

@@ -18,15 +18,16 @@ from torch import Tensor
 
 from hat_ros.array_types import Float, UInt8
 from hat_ros.cache import cached_arrays
-from hat_ros.config import HatConfig
-from hat_ros.geometry import lie
+from hat_ros.config import HatConfig, NetsConfig
+from hat_ros.geometry import lie, masks
 from hat_ros.nets import megapose as mp
 from hat_ros.nets.checkpoint import load_into, load_state
 from hat_ros.nets.runtime import Runtime
 from hat_ros.nets.so3_grid import so3_grid
 from hat_ros.target.model import Target
 from hat_ros.target.network_views import NetworkViewRenderer
-from hat_ros.types import Camera, Candidates, Detection, Frame, PosePrior
+from hat_ros.target.rendering import Renderer, create_renderer
+from hat_ros.types import Camera, Candidates, Detection, Frame, PosePrior, Refined, RotationPrior
 
 LOG = logging.getLogger(__name__)
 
@@ -39,22 +40,28 @@ _CROP_SIZE = (mp.CROP_WIDTH, mp.CROP_HEIGHT)
 class MegaPose:
     """The two networks and the renderer around one target; also the refiner of GigaPose.
 
+    Args:
+        config: the whole configuration.
+        target: the CAD model.
+        network: whose device they share.
+
     Raises:
         WeightsError: a checkpoint is missing or does not fit.
     """
 
-    def __init__(self, config: HatConfig, target: Target) -> None:
+    def __init__(self, config: HatConfig, target: Target, network: str = "megapose") -> None:
         self.settings = config.hypotheses.megapose
-        self.runtime = Runtime(config.nets)
+        self._target = target
+        self.runtime = Runtime(config.nets, network)
         self.renderer = TorchViews(target, self.runtime)
-        self._coarse = self._load(mp.CoarseNet, "megapose_coarse", config.nets.weights_folder)
-        self._refiner = self._load(mp.RefinerNet, "megapose_refiner", config.nets.weights_folder)
+        self._coarse = self._load(mp.CoarseNet, "megapose_coarse", config.nets)
+        self._refiner = self._load(mp.RefinerNet, "megapose_refiner", config.nets)
         self.points = crop_points(target, self.runtime)
 
     def _load(
-        self, kind: type[mp.CoarseNet] | type[mp.RefinerNet], name: str, folder: str
+        self, kind: type[mp.CoarseNet] | type[mp.RefinerNet], name: str, nets: NetsConfig
     ) -> Callable[[Tensor], Tensor]:
-        state = load_state(name, folder or None)
+        state = load_state(name, nets.weights_folder, nets.allow_unverified)
         net = mp.build_net(kind, state)
         load_into(net, state, name)
         return self.runtime.place(net)
@@ -68,10 +75,33 @@ class MegaPose:
         return T, mp.score_coarse(self._coarse, image, K, T, self.points, self.renderer)
 
     def candidates(self, image: Tensor, K: Tensor, T_cam_target: Tensor, detection: Detection) -> Candidates:
-        """:meth:`refine` as candidates; a pose that the updates drove out of all bounds is none."""
+        """:meth:`refine` as candidates, ranked as given; a pose that the updates drove out of all bounds is none."""
         T, logits = (found.double().cpu().numpy() for found in self.refine(image, K, T_cam_target))
         rigid = lie.is_rigid(T)
-        return Candidates.from_matrices(T[rigid], logits[rigid], detection.box_xyxy)
+        return Candidates.from_matrices(T[rigid], logits[rigid], detection.box_xyxy, np.flatnonzero(rigid))
+
+    def refined(self, frame: Frame, detection: Detection | None, T_cam_target: Float) -> Refined | None:
+        """One pose (4, 4) refined, see :class:`~hat_ros.stages.PoseRefiner`: the network tells no covariance.
+
+        Its support is the coarse network's score. None when the updates drove the pose out of all bounds.
+        """
+        runtime = self.runtime
+        start = runtime.tensor(T_cam_target)[None]
+        T, logits = (
+            found.double().cpu().numpy()[0]
+            for found in self.refine(runtime.image(frame.rgb), runtime.tensor(frame.camera.K), start)
+        )
+        if not lie.is_rigid(T) or not T[2, 3] > 0 or not np.isfinite(logits):
+            return None
+        overlap = float("nan")
+        if detection is not None and detection.silhouette:
+            overlap = masks.overlap(self._silhouettes.render(T, frame.camera).mask, detection.mask)
+        score = float(1.0 / (1.0 + np.exp(-np.clip(logits, -50.0, 50.0))))
+        return Refined(lie.row_from_matrix(T), np.full((6, 6), np.nan), overlap, score, overlap)
+
+    @cached_property
+    def _silhouettes(self) -> Renderer:
+        return create_renderer("rays", self._target)
 
     @torch.inference_mode()
     def score_prepared(self, image: Tensor, boxes: Tensor, renders: Tensor) -> Tensor:
@@ -104,6 +134,12 @@ class MegaPoseHypotheses:
         logits = self._megapose.score_prepared(image, boxes, self._coarse_views(frame.camera))
         best = logits.topk(min(self._n_candidates, len(logits))).indices
         return self._megapose.candidates(image, K, T[best], detection)
+
+    def refine(
+        self, frame: Frame, detection: Detection | None, T_cam_target: Float, prior: RotationPrior | None = None
+    ) -> Refined | None:
+        """See :class:`~hat_ros.stages.PoseRefiner`; the prior is not used."""
+        return self._megapose.refined(frame, detection, T_cam_target)
 
     def reset(self) -> None:
         """Nothing is learned from earlier frames."""

@@ -50,8 +50,8 @@ class PicoPoseHypotheses:
     def __init__(self, config: HatConfig, target: Target) -> None:
         self._settings = config.hypotheses.picopose
         self._n_candidates = config.hypotheses.max_candidates
-        self._runtime = Runtime(config.nets)
-        state = load_state("picopose", config.nets.weights_folder or None)
+        self._runtime = Runtime(config.nets, "picopose")
+        state = load_state("picopose", config.nets.weights_folder, config.nets.allow_unverified)
         self._net = pp.PicoPoseNet()
         load_into(self._net, state, "picopose")
         self._runtime.place(self._net)

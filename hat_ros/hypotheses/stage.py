@@ -9,7 +9,8 @@ from hat_ros.config import HatConfig
 from hat_ros.core.cadence import Cadence
 from hat_ros.core.guard import guard_candidates
 from hat_ros.core.keyframes import KeyframeSchedule
-from hat_ros.stages import create_backend
+from hat_ros.segmentation.annotated import pad_box
+from hat_ros.stages import PoseRefiner, create_backend
 from hat_ros.target.exact_symmetry import symmetry_of
 from hat_ros.target.model import Target
 from hat_ros.types import Candidates, Detection, Frame, PosePrior
@@ -31,6 +32,7 @@ class HypothesisStage:
     def __init__(self, config: HatConfig, target: Target) -> None:
         self._max_candidates = config.hypotheses.max_candidates
         self._drop_implausible = config.hypotheses.guard
+        self._region = config.segmentation
         self._schedule = KeyframeSchedule(config.keyframes)
         self._cadence = Cadence()
         self._apart_deg, self._min_lead = config.fusion.gate_angle_deg, config.refinement.min_margin
@@ -53,13 +55,19 @@ class HypothesisStage:
         if not self._schedule.update(detection is not None, healthy, failed, n_missed) or detection is None:
             return Candidates.none()
         self._changed = False
-        candidates = self._backend.generate(frame, detection, prior)
-        if len(candidates) > self._max_candidates:
-            keep = slice(self._max_candidates)
-            candidates = Candidates(candidates.pose_rows[keep], candidates.log_score[keep], candidates.box_xyxy)
-        candidates = self._one_of_equals(guard_candidates(candidates, self._drop_implausible), prior)
+        candidates = self._one_of_equals(self.generate(frame, detection, prior), prior)
         self._schedule.answered(decided=candidates.lead(self._apart_deg) >= self._min_lead)
         return candidates
+
+    def generate(self, frame: Frame, detection: Detection, prior: PosePrior | None) -> Candidates:
+        """Candidates of one image, whether it is a keyframe or not; arguments and errors as for :meth:`update`."""
+        candidates = self._backend.generate(frame, self._seen(detection), prior).first(self._max_candidates)
+        return guard_candidates(candidates, self._drop_implausible)
+
+    @property
+    def refiner(self) -> PoseRefiner | None:
+        """What the backend refines poses with, None when it has nothing of its own."""
+        return self._backend if isinstance(self._backend, PoseRefiner) else None
 
     def reset(self) -> None:
         """Forget earlier frames; the next frame with a detection is a keyframe."""
@@ -78,6 +86,12 @@ class HypothesisStage:
         if len(candidates):
             self._R_reference = candidates.T_cam_target[np.argmax(candidates.log_score), :3, :3]
         return candidates
+
+    def _seen(self, detection: Detection) -> Detection:
+        """The region that the backend is given; motion has the detection as it is."""
+        if self._region.pose_region == "detection" or not detection.silhouette:
+            return detection
+        return Detection(pad_box(detection.mask, self._region.box_padding), silhouette=False)
 
     def _observe(self, detection: Detection | None) -> None:
         """Note when a detection is of something else than the one before, lacks a part of it or holds more."""

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import numpy as np
 import yaml
 
 from hat_ros.array_types import Float, UInt8
@@ -123,7 +124,12 @@ class BagWriter:
         self.write_message(topics.IMAGE_COMPRESSED, make.compressed(stamp_ns, frame_id, kind, data), stamp_ns)
 
     def write_target(
-        self, mesh: str | Path, unit_scale: float = 1.0, name: str | None = None, symmetry: Symmetry | None = None
+        self,
+        mesh: str | Path,
+        unit_scale: float = 1.0,
+        name: str | None = None,
+        symmetry: Symmetry | None = None,
+        T_label_cad: Float | None = None,
     ) -> None:
         """Put a copy of the CAD model, of what it names beside it, and a ``target.yaml`` into the bag's folder.
 
@@ -132,12 +138,15 @@ class BagWriter:
             unit_scale: metres per unit of the file.
             name: name of the target, by default that of the file.
             symmetry: what is declared of it; None = nothing.
+            T_label_cad: (4, 4) from the file's axes to those of the poses; None = the same.
         """
         mesh = Path(mesh)
         with _as_run_error(self.path):
             copy = copy_model(mesh, self.path)
-            content = {"mesh": copy, "unit_scale": float(unit_scale), "name": name or mesh.stem}
+            content: dict[str, Any] = {"mesh": copy, "unit_scale": float(unit_scale), "name": name or mesh.stem}
             content |= {} if symmetry is None else declaration_of(symmetry)
+            if T_label_cad is not None and not np.array_equal(T_label_cad, np.eye(4)):
+                content["T_label_cad"] = T_label_cad.tolist()
             (self.path / TARGET_FILE).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
 
     def close(self) -> None:

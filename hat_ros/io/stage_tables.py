@@ -90,7 +90,7 @@ class StageWire(TableWire):
 def _candidate_rows(candidates: Candidates) -> Float:
     n = len(candidates)
     boxes = np.broadcast_to(candidates.box_xyxy, (n, 4))
-    return np.column_stack([candidates.pose_rows, candidates.log_score, np.arange(n, dtype=np.float64), boxes])
+    return np.column_stack([candidates.pose_rows, candidates.log_score, candidates.rank, boxes])
 
 
 def admitted_from(message: Any) -> Admitted:
@@ -103,14 +103,14 @@ def _candidates_from_rows(rows: Float) -> Candidates:
     if not len(rows):
         return Candidates.none()
     pose_rows, score, rank, boxes = rows[:, :7].copy(), rows[:, 7].copy(), rows[:, 8], rows[:, 9:13]
-    if not np.array_equal(rank, np.arange(len(rows))):
-        raise WireError(f"column 'rank' must count from 0, found {rank.tolist()}")
+    if not (np.all(rank >= 0) and np.array_equal(rank, np.floor(rank)) and len(np.unique(rank)) == len(rank)):
+        raise WireError(f"column 'rank' must hold different whole numbers from 0 on, found {rank.tolist()}")
     if not np.array_equal(boxes, np.broadcast_to(boxes[0], boxes.shape), equal_nan=True):
         raise WireError("columns bx0 by0 bx1 by1 must be the same in all rows of one frame")
     if np.isnan(score).any() or np.isposinf(score).any():
         raise WireError(f"column 'score' must be a number or -inf, found {score.tolist()}")
     check_poses(pose_rows[np.isfinite(score)])  # a dropped candidate keeps its slot, whatever is in it
-    return Candidates(pose_rows, score, boxes[0].copy())
+    return Candidates(pose_rows, score, boxes[0].copy(), rank.astype(np.int64))
 
 
 def candidates_from(message: Any) -> Candidates:

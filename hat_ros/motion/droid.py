@@ -48,10 +48,11 @@ class DroidSlam:
 
     def __init__(self, config: HatConfig, target: Target | None, model: FlowModel | None = None) -> None:
         self._config, self._masked = config.slam.droid, config.slam.masked
-        runtime = Runtime(config.nets, as_released=torch.float16)
+        runtime = Runtime(config.nets, "droid", as_released=torch.float16)
         self._device = runtime.device
         self._model = model or DroidNet.from_checkpoint(
-            config.nets.weights_folder or None,
+            config.nets.weights_folder,
+            config.nets.allow_unverified,
             device=runtime.device,
             autocast=runtime.dtype if runtime.reduced_precision else None,
         )

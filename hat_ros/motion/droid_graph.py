@@ -62,6 +62,11 @@ def neighbour_pairs(first: int, end: int, radius: int) -> Pairs:
     return np.stack([i[close], j[close]], axis=1)
 
 
+def ascending(values: Float32 | Index) -> Index:
+    """Order of the values (n,), equal ones as the released tracker has them: by torch's sort, which is not stable."""
+    return torch.argsort(torch.from_numpy(np.ascontiguousarray(values))).numpy()
+
+
 def proximity_pairs(
     distance: Float32,
     first_i: int,
@@ -99,7 +104,7 @@ def proximity_pairs(
             chosen += [(a, b), (b, a)]
             if b >= first_j:
                 d[a - first_i, b - first_j] = np.inf
-    for flat in np.argsort(d, axis=None, kind="stable"):
+    for flat in ascending(d.ravel()):
         row, column = divmod(int(flat), n_j)
         if d[row, column] > rule.threshold:
             # Candidates come in ascending order, but one may have been suppressed since it was sorted.
@@ -163,7 +168,7 @@ class FactorGraph:
             return
         if make_room and len(self) + len(pairs) > self.max_factors:
             # The released tracker compares the values of the sorting permutation, not ranks, with the limit.
-            order = np.argsort(self.age, kind="stable")
+            order = ascending(self.age)
             self.drop(order >= self.max_factors - len(pairs), retire=True)
         self._plan = None
         frames, new_i, new_j = self.keyframes, *(self._send(pairs[:, side]) for side in (0, 1))

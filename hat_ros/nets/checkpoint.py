@@ -1,9 +1,10 @@
 """Public network weights: where they come from, where they go, and how they are read safely.
 
 Nothing is ever downloaded. A checkpoint is looked for in one folder: ``nets.weights_folder``, else ``$HAT_WEIGHTS``,
-else ``$XDG_DATA_HOME/hat_ros/weights``. A pickled file is opened only after its SHA-256 agrees with the published one,
-and then with ``weights_only=True``; safetensors hold no code, so for them names and shapes are the whole check.
-:func:`convert` turns a pickled file into safetensors once, reading it without running anything that it names.
+else ``$XDG_DATA_HOME/hat_ros/weights``, or up to two folders below, as publishers lay it out. A pickled file is opened
+only after its SHA-256 agrees with the published one or the user allows another, and then with ``weights_only=True``;
+safetensors hold no code, so for them names and shapes are the whole check. :func:`convert` turns a pickled file into
+safetensors once, reading it without running anything that it names.
 
 This module imports torch and safetensors only inside the functions that read tensors, so that listing and checking
 work without them.
@@ -12,6 +13,7 @@ work without them.
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import pickle
 from collections.abc import Iterator, Mapping
@@ -23,6 +25,8 @@ from hat_ros.nets.checkpoint_registry import CHECKPOINTS, Checkpoint
 
 if TYPE_CHECKING:
     import torch
+
+LOG = logging.getLogger(__name__)
 
 _NO_CHECKSUM = "none published"
 
@@ -56,12 +60,15 @@ def find(name: str, folder: str | Path | None = None) -> Path:
     """
     entry = checkpoint_named(name)
     root = weights_folder(folder)
+    file = entry.filename
     if entry.library_folder:
-        found = [root / entry.filename] if (root / entry.filename / "config.json").is_file() else []
+        # The last: as the publisher's own tools keep what they have fetched.
+        patterns = [f"{place}/config.json" for place in (file, f"*/{file}", f"models--*--{file}/snapshots/*")]
     else:
-        found = [path for path in (root / entry.converted_filename, root / entry.filename) if path.is_file()]
+        patterns = [entry.converted_filename, file, f"*/{file}", f"*/*/{file}"]
+    found = [path for pattern in patterns for path in sorted(root.glob(pattern)) if path.is_file()]
     if found:
-        return found[0]
+        return found[0].parent if entry.library_folder else found[0]
     names = f"the folder {entry.filename} is not"
     if not entry.library_folder:
         names = f"neither {entry.filename} nor {entry.converted_filename} is"
@@ -94,8 +101,13 @@ def verify_companions(entry: Checkpoint, folder: Path) -> None:
         _verify(entry, file, digest)
 
 
-def load_state(name: str, folder: str | Path | None = None) -> dict[str, torch.Tensor]:
+def load_state(name: str, folder: str | Path | None = None, allow_unverified: bool = False) -> dict[str, torch.Tensor]:
     """Tensors of a checkpoint on the CPU, under the names that our networks use.
+
+    Args:
+        name: registry name.
+        folder: the weights folder.
+        allow_unverified: take a file of another checksum than the published one, with a warning.
 
     Raises:
         WeightsError: missing, altered, unreadable, or not a flat mapping of names to tensors.
@@ -107,7 +119,7 @@ def load_state(name: str, folder: str | Path | None = None) -> dict[str, torch.T
         raise WeightsError(f"{name}: {path} is a folder for the transformers library, not a state dict")
     if path.suffix == ".safetensors":
         return _read_safetensors(path)
-    _verify(entry, path, entry.sha256)
+    _verify(entry, path, entry.sha256, allow_unverified)
     torch = _import("torch")
     _refuse_program(path)
     try:
@@ -122,7 +134,9 @@ def load_state(name: str, folder: str | Path | None = None) -> dict[str, torch.T
 
 
 def load_into(module: torch.nn.Module, state: Mapping[str, torch.Tensor], name: str) -> None:
-    """Copy a state dict into a network, strictly: same names, same shapes, finite values.
+    """Copy a state dict into a network: every tensor of it, same names, same shapes, finite values.
+
+    What else a publisher stored beside them (a head for training, say) is left out, and said.
 
     Args:
         module: the network.
@@ -130,10 +144,13 @@ def load_into(module: torch.nn.Module, state: Mapping[str, torch.Tensor], name: 
         name: what the error messages call the checkpoint.
 
     Raises:
-        WeightsError: names or shapes differ, or a value is not finite.
+        WeightsError: a tensor is missing, has another shape, or a value is not finite.
     """
     verify_fit(module, state, name)
-    module.load_state_dict(dict(state), strict=True)
+    wanted = module.state_dict()
+    if extra := [key for key in state if key not in wanted]:
+        LOG.info("%s: %d tensors that the network does not have are left out%s", name, len(extra), _some(extra))
+    module.load_state_dict({key: state[key] for key in wanted}, strict=True)
 
 
 def verify_fit(module: torch.nn.Module, state: Mapping[str, torch.Tensor], name: str) -> None:
@@ -144,13 +161,13 @@ def verify_fit(module: torch.nn.Module, state: Mapping[str, torch.Tensor], name:
     """
     wanted = module.state_dict()
     missing = [key for key in wanted if key not in state]
-    extra = [key for key in state if key not in wanted]
-    if missing or extra:
+    if missing:
         raise WeightsError(
-            f"{name}: the checkpoint does not fit the network: {len(missing)} tensors missing{_some(missing)}, "
-            f"{len(extra)} unknown{_some(extra)}; it must be the file named by `hat weights list`"
+            f"{name}: the checkpoint does not fit the network: {len(missing)} tensors missing{_some(missing)}; "
+            f"it must be the file named by `hat weights list`"
         )
-    for key, tensor in state.items():
+    for key in wanted:
+        tensor = state[key]
         if tuple(tensor.shape) != tuple(wanted[key].shape):
             raise WeightsError(
                 f"{name}: tensor '{key}' must have shape {tuple(wanted[key].shape)}, found {tuple(tensor.shape)}; "
@@ -160,7 +177,9 @@ def verify_fit(module: torch.nn.Module, state: Mapping[str, torch.Tensor], name:
             raise WeightsError(f"{name}: tensor '{key}' holds values that are not finite; get the file again")
 
 
-def convert(name: str, source: str | Path | None = None, folder: str | Path | None = None) -> Path:
+def convert(
+    name: str, source: str | Path | None = None, folder: str | Path | None = None, allow_unverified: bool = False
+) -> Path:
     """Rewrite a pickled checkpoint as ``<name>.safetensors`` in the weights folder; returns the new path.
 
     The pickle is read with a reader that knows tensors and plain containers only. Anything else that the file names
@@ -170,6 +189,7 @@ def convert(name: str, source: str | Path | None = None, folder: str | Path | No
         name: registry name.
         source: the pickled file; default is its place in the weights folder.
         folder: the weights folder.
+        allow_unverified: take a file of another checksum than the published one, with a warning.
 
     Raises:
         WeightsError: the file is missing, altered, a TorchScript archive, or holds no state dict.
@@ -179,10 +199,11 @@ def convert(name: str, source: str | Path | None = None, folder: str | Path | No
     if entry.library_folder:
         raise WeightsError(f"{name}: comes as a folder for the transformers library; there is nothing to convert")
     root = weights_folder(folder)
-    path = Path(source).expanduser() if source else root / entry.filename
+    places = sorted(path for above in ("", "*/", "*/*/") for path in root.glob(above + entry.filename))
+    path = Path(source).expanduser() if source else next(iter(places), root / entry.filename)
     if not path.is_file():
         raise WeightsError(f"{name}: {path} is not a file; get {entry.filename} from {entry.source}")
-    digest = _verify(entry, path, entry.sha256)
+    digest = _verify(entry, path, entry.sha256, allow_unverified)
     torch, safetensors = _import("torch"), _import("safetensors.torch")
     from hat_ros.nets.inert_pickle import inert_pickle
 
@@ -200,14 +221,18 @@ def convert(name: str, source: str | Path | None = None, folder: str | Path | No
     return out
 
 
-def _verify(entry: Checkpoint, path: Path, expected: str) -> str:
-    """SHA-256 of the file; raises when it differs from the published one."""
+def _verify(entry: Checkpoint, path: Path, expected: str, allow_unverified: bool = False) -> str:
+    """SHA-256 of the file; raises when it differs from the published one, unless that is allowed."""
     digest = sha256_of(path)
-    if expected and digest != expected:
+    if not expected or digest == expected:
+        return digest
+    if not allow_unverified:
         raise WeightsError(
             f"{entry.name}: {path} has SHA-256 {digest}, published is {expected}: the file is damaged or another "
-            f"version; get it again from {entry.source}"
+            f"version; get it again from {entry.source}, or, if you know it, go on with --allow-unverified "
+            f"(nets.allow_unverified)"
         )
+    LOG.warning("%s: %s has SHA-256 %s, published is %s; taken all the same", entry.name, path, digest, expected)
     return digest
 
 

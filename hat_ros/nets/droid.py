@@ -184,6 +184,7 @@ class DroidNet(nn.Module):
     def from_checkpoint(
         cls,
         folder: str | Path | None = None,
+        allow_unverified: bool = False,
         device: str | torch.device = "cpu",
         autocast: torch.dtype | None = None,
     ) -> DroidNet:
@@ -193,7 +194,7 @@ class DroidNet(nn.Module):
             WeightsError: the checkpoint is missing, altered or does not fit.
         """
         net = cls(autocast)
-        checkpoint.load_into(net, checkpoint.load_state("droid", folder), "droid")
+        checkpoint.load_into(net, checkpoint.load_state("droid", folder, allow_unverified), "droid")
         return net.requires_grad_(False).eval().to(device)
 
     @property

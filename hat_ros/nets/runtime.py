@@ -14,6 +14,7 @@ from hat_ros.config import NetsConfig
 from hat_ros.errors import ConfigError
 
 _PRECISIONS = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
+NETWORKS = ("mask2former", "megapose", "picopose", "gigapose", "droid")
 # Larger batches fall out of the processor's cache: measured a quarter slower at 64 images of 240 x 320.
 _CPU_BATCH = 8
 
@@ -23,6 +24,7 @@ class Runtime:
 
     Args:
         config: the ``nets`` section.
+        network: name by which ``nets.device`` may give it a device of its own, one of :data:`NETWORKS`.
         as_released: what ``nets.precision: auto`` means on an accelerator: the precision that the network was
             published to run in.
 
@@ -34,8 +36,8 @@ class Runtime:
         ConfigError: the device is unknown or not on this machine.
     """
 
-    def __init__(self, config: NetsConfig, as_released: torch.dtype = torch.float32) -> None:
-        self.device = choose_device(config.device)
+    def __init__(self, config: NetsConfig, network: str, as_released: torch.dtype = torch.float32) -> None:
+        self.device = choose_device(device_of(config.device, network))
         named = as_released if config.precision == "auto" else _PRECISIONS[config.precision]
         self.dtype = torch.float32 if self.device.type == "cpu" else named
 
@@ -82,6 +84,24 @@ class Runtime:
         step = size if self.device.type != "cpu" else min(size, _CPU_BATCH)
         for start in range(0, n_images, step):
             yield slice(start, min(start + step, n_images))
+
+
+def device_of(names: str, network: str) -> str:
+    """The device that ``nets.device`` names for a network: its own, else the one for all.
+
+    Raises:
+        ConfigError: a part is malformed or names no network.
+    """
+    chosen, own = "auto", {}
+    for part in names.split(","):
+        key, separator, device = (word.strip() for word in part.rpartition("="))
+        if not separator:
+            chosen = device
+        elif key in NETWORKS:
+            own[key] = device
+        else:
+            raise ConfigError(f"nets.device: '{key}' is no network, known are {', '.join(NETWORKS)}")
+    return own.get(network, chosen)
 
 
 def choose_device(name: str) -> torch.device:

@@ -35,7 +35,7 @@ class Mask2FormerSegmenter:
 
     def __init__(self, config: HatConfig, target: Target) -> None:
         self._settings = config.segmentation.mask2former
-        self._runtime = Runtime(config.nets)
+        self._runtime = Runtime(config.nets, "mask2former")
         folder = find("mask2former", config.nets.weights_folder or None)
         self._processor, model = load_mask2former(folder)
         # The library's decorator hides what the method takes.

@@ -1,14 +1,14 @@
 """Reading CAD models: from a mesh file or a ``target.yaml`` to a :class:`hat_ros.target.model.Target`.
 
 The coordinates are the file's own, with the transforms of its scene graph applied and no change of axes: a glTF stays
-y-up if it was modelled so.
+y-up if it was modelled so. Only a ``T_label_cad`` in its ``target.yaml`` turns and shifts it.
 """
 
 from __future__ import annotations
 
 import hashlib
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import trimesh
 
 from hat_ros.array_types import Bool, Float, Float32, Int, Int32, UInt8
 from hat_ros.errors import MeshError
+from hat_ros.geometry import lie
 from hat_ros.geometry.symmetry import Symmetry
 from hat_ros.target.companions import say_once
 from hat_ros.target.mesh_file import read_scene, read_target_yaml
@@ -46,19 +47,22 @@ class ModelFile:
         unit_scale: metres per unit of the file.
         name: name of the target.
         symmetry: what is declared of it; None = nothing.
+        T_label_cad: (4, 4) from the axes of the file, in metres, to the frame that poses refer to.
     """
 
     mesh: Path
     unit_scale: float
     name: str
     symmetry: Symmetry | None = None
+    T_label_cad: Float = field(default_factory=lambda: np.eye(4))
 
 
 def find_model(path: str | Path, unit_scale: float | None = 1.0) -> ModelFile:
     """The CAD file that a path names, itself or through a ``target.yaml``.
 
     ``target.yaml`` holds ``mesh`` (file beside it), ``unit_scale`` (metres per file unit, or ``auto``), ``name``, and
-    may declare symmetries as BOP does, in metres: ``symmetries_discrete`` and ``symmetries_continuous``.
+    ``T_label_cad`` where a data set's labels refer to other axes than the file's. It may declare symmetries as BOP
+    does, in metres, about the axes that poses refer to: ``symmetries_discrete`` and ``symmetries_continuous``.
 
     Args:
         path: obj, ply, stl, glb or a ``target.yaml``.
@@ -70,12 +74,12 @@ def find_model(path: str | Path, unit_scale: float | None = 1.0) -> ModelFile:
     path = Path(path)
     if not path.is_file():
         raise MeshError(f"CAD model {path}: no such file")
-    stated, name, symmetry = unit_scale, path.stem, None
-    if path.suffix.lower() in (".yaml", ".yml"):
-        path, stated, name, symmetry = read_target_yaml(path)
-        stated = None if stated is None or unit_scale is None else unit_scale * stated
-    scale = guess_unit_scale(read_scene(path), path) if stated is None else stated
-    return ModelFile(path, scale, name, symmetry)
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        scale = guess_unit_scale(read_scene(path), path) if unit_scale is None else unit_scale
+        return ModelFile(path, scale, path.stem)
+    mesh, stated, name, symmetry, T_label_cad = read_target_yaml(path)
+    scale = guess_unit_scale(read_scene(mesh), mesh) if stated is None or unit_scale is None else unit_scale * stated
+    return ModelFile(mesh, scale, name, symmetry, T_label_cad)
 
 
 def load_target(path: str | Path, unit_scale: float | None = 1.0) -> Target:
@@ -89,12 +93,14 @@ def load_target(path: str | Path, unit_scale: float | None = 1.0) -> Target:
         MeshError: unreadable, other format, empty, not finite, or of absurd size or extent.
     """
     model = find_model(path, unit_scale)
-    target = target_from_scene(read_scene(model.mesh), model.name, model.unit_scale)
+    target = target_from_scene(read_scene(model.mesh), model.name, model.unit_scale, model.T_label_cad)
     return replace(target, declared_symmetry=model.symmetry)
 
 
-def target_from_scene(scene: trimesh.Scene, name: str, unit_scale: float = 1.0) -> Target:
-    """A target from a ``trimesh`` scene, its transforms applied.
+def target_from_scene(
+    scene: trimesh.Scene, name: str, unit_scale: float = 1.0, T_label_cad: Float | None = None
+) -> Target:
+    """A target from a ``trimesh`` scene, its transforms applied, and last ``T_label_cad`` (4, 4), in metres.
 
     Raises:
         MeshError: no triangles, NaN, or absurd extents.
@@ -102,7 +108,10 @@ def target_from_scene(scene: trimesh.Scene, name: str, unit_scale: float = 1.0) 
     if not (np.isfinite(unit_scale) and unit_scale > 0):
         raise MeshError(f"CAD model {name}: unit_scale must be a positive number, found {unit_scale}")
     with np.errstate(over="ignore", invalid="ignore"):  # coordinates that overflow are refused below by their extent
-        found = [_part(scene, node, name) for node in _ordered_nodes(scene)]
+        T_label_file = None
+        if T_label_cad is not None and not np.array_equal(T_label_cad, np.eye(4)):
+            T_label_file = lie.transform(T_label_cad[:3, :3], T_label_cad[:3, 3] / unit_scale)
+        found = [_part(scene, node, name, T_label_file) for node in _ordered_nodes(scene)]
     parts = [part for part in found if part is not None]
     if not parts:
         raise MeshError(f"CAD model {name}: it holds no triangles; export the surface as a triangle mesh")
@@ -179,8 +188,9 @@ class _Part:
     has_color: bool
 
 
-def _part(scene: trimesh.Scene, node: str, name: str) -> _Part | None:
-    T, geometry_name = scene.graph[node]
+def _part(scene: trimesh.Scene, node: str, name: str, T_label_file: Float | None) -> _Part | None:
+    T_file_part, geometry_name = scene.graph[node]
+    T = T_file_part if T_label_file is None else T_label_file @ T_file_part
     mesh = scene.geometry[geometry_name]
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         return None

@@ -15,8 +15,10 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from hat_ros.array_types import Float
 from hat_ros.config.yaml_text import read_yaml
 from hat_ros.errors import ConfigError, MeshError
+from hat_ros.geometry import lie
 from hat_ros.geometry.symmetry import Symmetry, symmetry_from_declaration
 from hat_ros.target.brep import BREP_SUFFIXES, glb_of_brep
 from hat_ros.target.companions import MATERIAL_SUFFIX, Companions, copy_with_companions, say_once
@@ -25,15 +27,15 @@ from hat_ros.target.units import AUTO
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb", *BREP_SUFFIXES)
 _SYMMETRY_KEYS = ("symmetries_discrete", "symmetries_continuous")
-_TARGET_KEYS = ("mesh", "unit_scale", "name", *_SYMMETRY_KEYS)
+_TARGET_KEYS = ("mesh", "unit_scale", "name", "T_label_cad", *_SYMMETRY_KEYS)
 MAX_FILE_BYTES = 256 * 2**20
 MAX_FACES = 4_000_000
 MAX_VERTICES = 8_000_000
 MAX_NODES = 20_000
 
 
-def read_target_yaml(path: Path) -> tuple[Path, float | None, str, Symmetry | None]:
-    """Mesh file, metres per unit (None = to be guessed), name and declared symmetry from a ``target.yaml``.
+def read_target_yaml(path: Path) -> tuple[Path, float | None, str, Symmetry | None, Float]:
+    """Mesh file, metres per unit (None = to be guessed), name, declared symmetry and ``T_label_cad`` (4, 4).
 
     Raises:
         MeshError: malformed, or the mesh does not lie beside it.
@@ -55,6 +57,7 @@ def read_target_yaml(path: Path) -> tuple[Path, float | None, str, Symmetry | No
         raise MeshError(f"{path}: mesh '{data['mesh']}' must lie in the same folder")
     if mesh.suffix.lower() not in MESH_SUFFIXES:
         raise MeshError(f"{path}: mesh '{data['mesh']}' must be one of {', '.join(MESH_SUFFIXES)}")
+    T_label_cad = _rigid(data.get("T_label_cad"), path)
     symmetry = None
     if set(_SYMMETRY_KEYS) & set(data):
         try:
@@ -62,7 +65,23 @@ def read_target_yaml(path: Path) -> tuple[Path, float | None, str, Symmetry | No
             symmetry = symmetry_from_declaration(discrete, continuous, unit_m=1.0)
         except ValueError as error:
             raise MeshError(f"{path}: {error}") from None
-    return mesh, None if scale == AUTO else float(scale), str(data.get("name", mesh.stem)), symmetry
+    return mesh, None if scale == AUTO else float(scale), str(data.get("name", mesh.stem)), symmetry, T_label_cad
+
+
+def _rigid(value: object, path: Path) -> Float:
+    """``T_label_cad``: the identity when it is not stated."""
+    if value is None:
+        return np.eye(4)
+    try:
+        T = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        T = np.zeros(0)
+    if T.shape != (4, 4) or not lie.is_rigid(T, 1e-6):
+        raise MeshError(
+            f"{path}: T_label_cad must be four rows of four numbers, a rotation and a shift in metres that take points "
+            f"of the CAD file to the frame of the labels"
+        )
+    return T
 
 
 def read_scene(path: Path) -> trimesh.Scene:

@@ -1,5 +1,7 @@
 """Stage 4 as the tracker sees it: states, covariance, quaternion signs, bounded memory."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from temporal_scene import make_scene, preset
@@ -75,6 +77,22 @@ def test_without_a_limit_the_last_pose_is_held_and_never_lost():
     blind = _run(stage, scene, range(21, 120), anchored=False, moving=False)
     assert {e.state for e in blind} == {TrackState.COASTING}
     np.testing.assert_array_equal(blind[-1].pose_row, last.pose_row)
+
+
+def test_frames_that_are_not_scored_count_for_nothing():
+    """Every third frame is a target: all that comes of these is what comes of a recording of these alone."""
+    scene = make_scene(120, gap=12)
+    sparse, alone = _stage(preset()), _stage(preset())
+    for i in range(120):
+        selection = _selection(scene.T_cam_target[i]) if i % 12 == 0 else Selection.none()
+        motion, target = scene.observations.motion(i), i % 3 == 0
+        seen = sparse.update(replace(frame(i), scored=target), None, motion, selection)
+        if target:
+            expected = alone.update(frame(i), None, motion, selection)
+            np.testing.assert_array_equal(seen.pose_row, expected.pose_row)
+            assert seen.gap_frames == expected.gap_frames
+        else:
+            assert not seen.state.has_pose
 
 
 def test_the_estimate_reports_what_happened():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hat_ros.config import HatConfig, KeyframeConfig
+from hat_ros.config import HatConfig, KeyframeConfig, SegmentationConfig
 from hat_ros.geometry import lie
 from hat_ros.geometry.symmetry import Symmetry, about_center
 from hat_ros.hypotheses import stage as hypothesis_stage
@@ -43,6 +43,27 @@ def test_what_was_tried_on_a_part_of_the_target_is_tried_again_once_all_of_it_is
     assert _asked(monkeypatch, [part] + 11 * [whole]) == [0, 2, 8]
     assert _asked(monkeypatch, 12 * [whole]) == [0, 6]
     assert _asked(monkeypatch, 7 * [whole] + 7 * [part]) == [0, 6, 8]
+
+
+@pytest.mark.parametrize(
+    ("region", "silhouette", "columns"), [("detection", True, (8, 40)), ("box", False, (4, 44))], ids=["all", "box"]
+)
+def test_the_backend_sees_the_region_that_is_asked_for(monkeypatch, region, silhouette, columns):
+    seen = []
+
+    class Watching(_Backend):
+        def generate(self, frame, detection, prior):
+            seen.append(detection)
+            return DECIDED
+
+    monkeypatch.setattr(hypothesis_stage, "create_backend", lambda *_: Watching())
+    config = HatConfig(segmentation=SegmentationConfig(pose_region=region, box_padding=0.125))
+    whole = _detection(8, 40)
+    whole.mask[8:20, 8:20] = False
+    HypothesisStage(config, None).update(Frame(1, np.zeros((64, 64, 3), np.uint8), CAMERA), whole, None)
+    assert seen[0].silhouette == silhouette
+    assert tuple(np.flatnonzero(seen[0].mask.any(axis=0))[[0, -1]] + [0, 1]) == columns
+    assert seen[0].mask[4:44, 4:44].all() != silhouette
 
 
 def test_a_part_missing_inside_the_box_counts(monkeypatch):

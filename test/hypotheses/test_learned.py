@@ -92,15 +92,51 @@ def test_megapose_on_a_gpu_agrees_with_the_cpu(target, frame, detection, tmp_pat
 
 
 def test_few_vertices_are_made_up_for_by_surface_points(target):
-    points = megapose.crop_points(target, Runtime(config_from_dict({}).nets))
+    points = megapose.crop_points(target, Runtime(config_from_dict({}).nets, "megapose"))
     assert points.crop.shape == (2000, 3)
     assert points.views.shape == (200, 3)
     np.testing.assert_allclose(points.crop.amax(dim=0), target.vertices_m.max(axis=0), atol=0.02)
 
 
-def test_box_padding_is_clipped_to_the_image():
-    padded = megapose.padded_box(np.array([10.0, 20.0, 110.0, 60.0]), 0.2, CAMERA)
-    np.testing.assert_allclose(padded, [0, 12, 130, 68])
+def test_box_padding_is_a_tenth_on_each_side_and_clipped_to_the_image():
+    padding = config_from_dict({}).hypotheses.megapose.box_padding
+    padded = megapose.padded_box(np.array([5.0, 20.0, 105.0, 60.0]), padding, CAMERA)
+    np.testing.assert_allclose(padded, [0, 16, 115, 64])
+
+
+def test_fewer_hypotheses_are_the_best_coarse_ones_and_not_the_best_refined(
+    target, frame, detection, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    save_rule_weights(tmp_path, "megapose_coarse", mp.CoarseNet())
+    save_rule_weights(tmp_path, "megapose_refiner", mp.RefinerNet())
+    monkeypatch.setattr(megapose, "so3_grid", lambda level: np.eye(4)[:, [3, 0, 1, 2]])
+    found = {}
+    for k in (4, 2):
+        settings = {"max_candidates": k, "megapose": {"refiner_iterations": 1}}
+        config = config_from_dict({"hypotheses": settings, "nets": {"weights_folder": str(tmp_path)}})
+        found[k] = megapose.MegaPoseHypotheses(config, target).generate(frame, detection, None)
+    assert sorted(found[4].rank) == [0, 1, 2, 3]
+    fewer = found[4].first(2)
+    np.testing.assert_allclose(fewer.pose_rows, found[2].pose_rows, atol=1e-4)
+    np.testing.assert_allclose(fewer.log_score, found[2].log_score, atol=1e-4)
+
+
+def test_megapose_refines_a_pose_given_and_says_how_well_its_silhouette_fits(
+    target, frame, detection, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    save_rule_weights(tmp_path, "megapose_coarse", mp.CoarseNet())
+    save_rule_weights(tmp_path, "megapose_refiner", mp.RefinerNet())
+    settings = {"megapose": {"refiner_iterations": 0}}
+    config = config_from_dict({"hypotheses": settings, "nets": {"weights_folder": str(tmp_path)}})
+    backend = megapose.MegaPoseHypotheses(config, target)
+    T = lie.transform(np.eye(3), np.array([0.0, 0.0, 6.0]))
+    refined = backend.refine(frame, detection, T)
+    np.testing.assert_allclose(refined.T_cam_target, T, atol=1e-6)
+    assert 0.1 < refined.overlap < 1.0
+    assert 0.0 < refined.support < 1.0
+    assert np.isnan(backend.refine(frame, None, T).overlap)
 
 
 def test_square_crop_is_even_inside_and_invertible():

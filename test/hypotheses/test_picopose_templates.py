@@ -36,7 +36,7 @@ def test_a_stopped_encoding_goes_on_where_it_was(monkeypatch, tmp_path):
 
     def load(extract):
         backend = object.__new__(picopose.PicoPoseHypotheses)
-        backend._runtime, backend._settings = Runtime(NetsConfig()), SimpleNamespace(batch_size=4)
+        backend._runtime, backend._settings = Runtime(NetsConfig(), "picopose"), SimpleNamespace(batch_size=4)
         backend._extract = extract
         backend._load_templates(SimpleNamespace(sha256="a"), "b")
         return backend

@@ -82,7 +82,7 @@ def rewritten(columns, rows, row, column, value):
 @pytest.mark.parametrize(
     ("column", "value", "complaint"),
     [
-        ("rank", 5.0, "must count from 0"),
+        ("rank", 0.5, "whole numbers from 0 on"),
         ("score", np.nan, "number or -inf"),
         ("score", np.inf, "number or -inf"),
         ("bx0", 7.0, "same in all rows"),

@@ -153,12 +153,45 @@ def test_load_into_is_strict():
     assert torch.equal(module.weight, torch.ones(2, 3))
     for wrong, text in (
         ({"weight": state["weight"]}, r"1 tensors missing \(bias\)"),
-        (state | {"more": torch.ones(1)}, r"1 unknown \(more\)"),
         (state | {"weight": torch.ones(3, 3)}, r"shape \(2, 3\), found \(3, 3\)"),
         (state | {"bias": torch.tensor([0.0, float("nan")])}, "not finite"),
     ):
         with pytest.raises(WeightsError, match=text):
             load_into(module, wrong, "toy")
+
+
+def test_what_a_publisher_stored_beside_the_network_is_left_out():
+    module = torch.nn.Linear(3, 2)
+    load_into(
+        module, {"weight": torch.ones(2, 3), "bias": torch.zeros(2), "head.w": torch.full((1,), torch.nan)}, "toy"
+    )
+    assert torch.equal(module.weight, torch.ones(2, 3))
+
+
+def test_another_checksum_says_how_to_go_on(folder, toy, caplog):
+    torch.save({"a": torch.ones(1)}, folder / "toy.pth")
+    toy(folder / "toy.pth")
+    torch.save({"a": torch.zeros(1)}, folder / "toy.pth")
+    for action in (load_state, convert):
+        with pytest.raises(WeightsError, match="--allow-unverified"):
+            action("toy")
+    assert load_state("toy", None, allow_unverified=True)["a"] == 0
+    assert "taken all the same" in caplog.text
+
+
+@pytest.mark.parametrize("place", ["megapose-models/", "a/b/"])
+def test_checkpoints_are_found_in_the_publishers_folders(folder, place):
+    path = folder / place / "coarse-rgb-906902141" / "checkpoint.pth.tar"
+    path.parent.mkdir(parents=True)
+    path.touch()
+    assert find("megapose_coarse") == path
+
+
+def test_mask2former_is_found_where_the_hub_keeps_it(folder):
+    path = folder / "models--facebook--mask2former-swin-large-coco-instance" / "snapshots" / "0123abc"
+    path.mkdir(parents=True)
+    (path / "config.json").write_text("{}")
+    assert find("mask2former") == path
 
 
 def test_registry_is_consistent():

@@ -98,11 +98,6 @@ def test_training_layer(data, iterations):
     assert worst(disparities, data[f"pyBA_it{iterations - 1}_disps"]) < 1e-4
 
 
-def test_training_layer_motion_only(data):
-    poses, _ = solve(data, disparities="disps_gt", iterations=3, rule=TRAINING_RULE, motion_only=True)
-    assert worst(poses, data["pyMoBA_it2_poses"]) < 5e-4
-
-
 def test_jacobians_as_published(data):
     layout = BundleLayout(data["ii"], data["jj"], 1, 8, "cpu")
     inputs = [tensor(data[name]) for name in ("poses_init", "disps_init", "intrinsics8", "target", "weight")]

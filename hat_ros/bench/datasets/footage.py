@@ -98,7 +98,7 @@ def import_footage(footage: Footage, out: str | Path, progress: Progress | None 
             writer.write_frame(stamp_ns, image, calibration.camera, lens=calibration.lens)
             if progress is not None:
                 progress(out.name, count, max(count, reader.count))
-        writer.write_target(model.mesh, model.unit_scale, model.name, model.symmetry)
+        writer.write_target(model.mesh, model.unit_scale, model.name, model.symmetry, model.T_label_cad)
     if not count:
         shutil.rmtree(partial)
         raise DatasetError(f"{footage.source}: holds no image that can be decoded")

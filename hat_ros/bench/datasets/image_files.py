@@ -68,6 +68,7 @@ class ImageRecording:
         image_depth: option ``camera.image_depth``, for 16-bit files.
         instance: number among several instances of one object in one scene; None = it occurs once.
         symmetry: what the data set declares of the target; None = what its ``target.yaml`` does.
+        targets_only: a pose is asked for at labelled frames alone.
     """
 
     name: str
@@ -82,6 +83,7 @@ class ImageRecording:
     image_depth: str = "auto"
     instance: int | None = None
     symmetry: Symmetry | None = None
+    targets_only: bool = False
 
     def __len__(self) -> int:
         return len(self.files)
@@ -116,7 +118,12 @@ class ImageRecording:
         for item in self.files[start:limit]:
             rgb, known = read_rgb(item.image, known)
             rectified = self._rectify(rgb, item.image, cv2.INTER_LINEAR)
-            yield Frame(item.stamp_ns, rectified, self.camera, self.given_mask(item) if masks else None)
+            mask = self.given_mask(item) if masks else None
+            yield Frame(item.stamp_ns, rectified, self.camera, mask, self.is_scored(item))
+
+    def is_scored(self, item: ImageFile) -> bool:
+        """Whether a pose is asked for at a frame."""
+        return not self.targets_only or item.T_cam_target is not None
 
     def given_mask(self, item: ImageFile) -> UInt8 | None:
         """(H, W) uint8 as in ``Frame.given_mask``, None when the frame brings no detection at all."""

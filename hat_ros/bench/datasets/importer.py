@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from hat_ros.array_types import UInt8
+from hat_ros.array_types import Float, UInt8
 from hat_ros.bench.datasets.detections import load_detections
 from hat_ros.bench.datasets.image_files import ImageFile, ImageRecording
 from hat_ros.errors import DatasetError, UsageError
@@ -23,7 +23,7 @@ from hat_ros.io.bag_writer import BagWriter
 from hat_ros.io.provenance import input_hash
 from hat_ros.target.mesh_file import companions_of
 from hat_ros.target.rendering import create_renderer
-from hat_ros.types import Frame
+from hat_ros.types import Camera, Frame
 
 LOG = logging.getLogger(__name__)
 
@@ -167,6 +167,7 @@ def _made_from(fmt: str, recording: ImageRecording, boxes: bool, detections: Pat
         **({"symmetry": declaration_of(model.symmetry)} if model.symmetry is not None else {}),
         # Where a target.yaml states a scale of its own.
         **({"unit_scale": model.unit_scale} if model.unit_scale != recording.unit_scale else {}),
+        **({} if np.array_equal(model.T_label_cad, np.eye(4)) else {"T_label_cad": model.T_label_cad.tolist()}),
         "boxes_from_labels": boxes,
         "detections": None if detections is None else detections.name,
         "detections_sha256": None if detections is None else input_hash(detections),
@@ -221,7 +222,7 @@ def _fill(recording: ImageRecording, bag: Path, made_from: dict[str, Any], progr
             if progress is not None:
                 progress(recording.name, index + 1, len(recording))
         model = recording.model_file()
-        writer.write_target(model.mesh, model.unit_scale, recording.name, model.symmetry)
+        writer.write_target(model.mesh, model.unit_scale, recording.name, model.symmetry, model.T_label_cad)
         text = json.dumps(made_from, indent=2) + "\n"
         (bag / IMPORT_FILE).write_text(text, encoding="utf-8")
     own_folder.mark(bag)
@@ -234,12 +235,19 @@ def _image(recording: ImageRecording, item: ImageFile, frame: Frame) -> bytes | 
     return item.image.read_bytes()
 
 
-def with_annotation_boxes(recording: ImageRecording) -> ImageRecording:
+def with_annotation_boxes(recording: ImageRecording, corners: bool = False) -> ImageRecording:
     """Boxes from the labels for frames without a mask: the paper's regions for SHIRT, which has no detector of its own.
 
     They land in ``/detection/mask`` as filled boxes (128) and are used by ``segmentation.backend=annotated`` alone.
+
+    Args:
+        recording: with labels.
+        corners: project the eight corners of the CAD model's bounding box (as published), not its vertices.
     """
     vertices = recording.load_target().vertices_m
+    if corners:
+        sides = np.stack([vertices.min(axis=0), vertices.max(axis=0)], axis=1)
+        vertices = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 3)
     files = []
     for item in recording.files:
         T = item.T_cam_target
@@ -294,7 +302,9 @@ def check_picture(recording: ImageRecording, width_px: int = 640) -> UInt8:
     """First, middle and last labelled frame over the CAD rendered at the true pose, outlined in green: (H, W, 3) RGB.
 
     Wrong units, quaternion order, frames or axes show at once: the outline misses the target. A mirrored or turned
-    model shows in the row below, which must look like the row above but for the light.
+    model shows in the row below, which must look like the row above but for the light. The axes of the labels are drawn
+    at the true pose (x red, y green, z blue, as long as the target's radius), and where ``T_label_cad`` says that the
+    CAD file has others, these too, thinner and dimmed.
 
     Raises:
         DatasetError: the recording has no ground truth.
@@ -302,14 +312,34 @@ def check_picture(recording: ImageRecording, width_px: int = 640) -> UInt8:
     labelled = [(item, T) for item in recording.files if (T := item.T_cam_target) is not None]
     if not labelled:
         raise DatasetError(f"{recording.name}: no frame has a ground truth, nothing to check")
-    renderer = create_renderer("rays", recording.load_target())
+    target = recording.load_target()
+    T_label_cad = recording.model_file().T_label_cad
+    renderer = create_renderer("rays", target)
     columns = []
     for item, T_cam_target in (labelled[0], labelled[len(labelled) // 2], labelled[-1]):
         rgb = next(replace(recording, files=[item]).frames(masks=False)).rgb.copy()
         view = renderer.render(T_cam_target, recording.camera)
         contours, _ = cv2.findContours(view.mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-        cv2.drawContours(rgb, contours, -1, (0, 255, 0), max(1, rgb.shape[1] // 640))
+        thickness = max(1, rgb.shape[1] // 640)
+        cv2.drawContours(rgb, contours, -1, (0, 255, 0), thickness)
+        if not np.array_equal(T_label_cad, np.eye(4)):
+            _draw_axes(rgb, recording.camera, T_cam_target @ T_label_cad, target.bounding_radius_m, 140, thickness)
+        _draw_axes(rgb, recording.camera, T_cam_target, target.bounding_radius_m, 255, 2 * thickness)
         height_px = round(rgb.shape[0] * width_px / rgb.shape[1])
         both = np.concatenate([rgb, view.rgb])
         columns.append(cv2.resize(both, (width_px, 2 * height_px), interpolation=cv2.INTER_AREA))
     return np.concatenate(columns, axis=1)
+
+
+def _draw_axes(
+    rgb: UInt8, camera: Camera, T_cam_frame: Float, length_m: float, brightness: int, thickness: int
+) -> None:
+    """Draw the axes of a frame (4, 4) into an image (H, W, 3): x red, y green, z blue; not those behind the camera."""
+    ends = T_cam_frame[:3, 3] + length_m * np.vstack([np.zeros(3), T_cam_frame[:3, :3].T])
+    if ends[:, 2].min() <= 0:
+        return
+    origin, *tips = np.rint(np.clip(camera.project(ends), -1e4, 1e4)).astype(int).tolist()
+    for axis, tip in enumerate(tips):
+        color = [0, 0, 0]
+        color[axis] = brightness
+        cv2.line(rgb, origin, tip, color, thickness, cv2.LINE_AA)

@@ -1,4 +1,4 @@
-"""SPARK-2024, stream 2: ``images/RT500/img000...jpg`` and one CSV with the poses of all sequences.
+"""SPARK-2024, stream 2: ``images/RT500/img000...jpg`` and CSV files with the poses of the sequences.
 
 Columns: sequence, filename, Tx, Ty, Tz, Qx, Qy, Qz, Qw (scalar last); ``p_cam = R(q) p + T``, metres. The camera is
 the published one; images have no lens distortion.
@@ -32,28 +32,46 @@ def open_spark(root: Path, model: Path | None = None, sequences: Collection[str]
     """
     if model is None:
         raise DatasetError("spark: name the CAD model with --model, the data set brings none")
-    path = _only_csv(root)
-    rows = _rows(path)
+    rows = _all_rows(root)
     camera = camera_from_label(K, SIZE, "spark")
     for name in sorted(rows):
         if sequences and name not in sequences:
             continue
         files = []
-        for index, (line, row) in enumerate(sorted(rows[name], key=lambda item: item[1]["filename"])):
-            image = named_in(root / "images", f"{name}/{row['filename']}", f"{path}, line {line}")
+        for index, (filename, (where, row)) in enumerate(sorted(rows[name].items())):
+            image = named_in(root / "images", f"{name}/{filename}", where)
             if not image.is_file():
-                raise DatasetError(f"{path}, line {line}: image {image} does not exist")
+                raise DatasetError(f"{where}: image {image} does not exist")
             quat, translation = [row[c] for c in _COLUMNS[5:]], [row[c] for c in _COLUMNS[2:5]]
-            pose = pose_from_label(quat, translation, "xyzw", f"{path}, line {line}")
+            pose = pose_from_label(quat, translation, "xyzw", where)
             files.append(ImageFile(stamp_of(index), image, pose))
         yield ImageRecording(name, camera, model, files)
 
 
-def _only_csv(root: Path) -> Path:
-    found = sorted(root.glob("*.csv"))
-    if len(found) != 1:
-        raise DatasetError(f"{root}: expected one CSV file beside 'images', found {len(found)}")
-    return found[0]
+def _all_rows(root: Path) -> dict[str, dict[str, tuple[str, dict[str, str]]]]:
+    """Sequence -> image -> (where it stands, row by lower-case column name), of all CSV files beside ``images``.
+
+    A file without the columns is left out where another has them; an image that stands twice must be the same.
+    """
+    paths = sorted(root.glob("*.csv"))
+    out: dict[str, dict[str, tuple[str, dict[str, str]]]] = {}
+    failure: DatasetError | None = None
+    if not paths:
+        raise DatasetError(f"{root}: expected a CSV file beside 'images', found none")
+    for path in paths:
+        try:
+            rows = _rows(path)
+        except DatasetError as error:
+            failure = failure or error
+            continue
+        for sequence, entries in rows.items():
+            for line, row in entries:
+                where, known = out.setdefault(sequence, {}).setdefault(row["filename"], (f"{path}, line {line}", row))
+                if any(known[column] != row[column] for column in _COLUMNS):
+                    raise DatasetError(f"{path}, line {line}: {sequence}/{row['filename']} has another pose in {where}")
+    if not out and failure is not None:
+        raise failure
+    return out
 
 
 def _rows(path: Path) -> dict[str, list[tuple[int, dict[str, str]]]]:

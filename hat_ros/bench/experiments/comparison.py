@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from hat_ros.bench.datasets.importer import detections_by_sequence, open_dataset
+from hat_ros.bench.datasets.protocols import protocol_of
 from hat_ros.bench.evaluation import metrics
 from hat_ros.bench.evaluation.result_folder import read_errors
 from hat_ros.bench.evaluation.tables import Column, Table
@@ -18,7 +19,7 @@ from hat_ros.bench.experiments.run_matrix import GRAPH, Job, Outcome
 from hat_ros.bench.methods.modes import MODES
 from hat_ros.bench.source import SourceSpec
 from hat_ros.bench.synth.suite import SUITE, SUITE_SETTINGS
-from hat_ros.errors import UsageError
+from hat_ros.errors import DatasetError, UsageError
 
 # A recording, and ``key=value`` settings of its own.
 Clip = tuple[SourceSpec, tuple[str, ...]]
@@ -51,6 +52,7 @@ _FIGURES = (
     Column("untrue_tracking_share", "false TRACKING", ".1%"),
     Column("inside_95_share", "in 95%", ".1%"),
     Column("fps", "fps", ".1f"),
+    Column("fps_without_detector", "fps w/o detector", ".1f"),
     Column("latency_ms_p50", "p50 ms", ".1f"),
     Column("latency_ms_p99", "p99 ms", ".1f"),
     Column("cpu_ms_mean", "cpu ms", ".1f"),
@@ -140,18 +142,34 @@ def clips_of_suite(root: Path) -> list[Clip]:
 
 
 def clips_of_dataset(
-    dataset: str, root: Path, model: Path | None, sequences: Sequence[str], detections: Path | None = None
+    dataset: str,
+    root: Path,
+    model: Path | None,
+    sequences: Sequence[str],
+    detections: Path | None = None,
+    published: bool = False,
 ) -> list[Clip]:
     """The sequences of a data set as published, without writing bags; each with its detections, if any are given.
+
+    ``published``: by the published protocol, and of its split alone unless sequences are named.
 
     Raises:
         UsageError, DatasetError: see :func:`hat_ros.bench.datasets.importer.open_dataset`.
     """
     root, model = root.resolve(), model and model.resolve()
-    recordings = list(open_dataset(dataset, root, model, sequences))
+    split = protocol_of(dataset).sequences if published and not sequences else sequences
+    try:
+        recordings = list(open_dataset(dataset, root, model, split))
+    except DatasetError as error:
+        if split and not sequences and "no sequence named" in str(error):
+            raise DatasetError(
+                f"{root}: nothing of the published split is there ({split[0]} to {split[-1]}); name what is with "
+                f"--sequence, or take everything with --protocol none"
+            ) from None
+        raise
     found = {} if detections is None else detections_by_sequence(detections.resolve(), recordings)
     names = [recording.name for recording in recordings]
-    return [(SourceSpec(root, dataset, name, model, found.get(name)), ()) for name in names]
+    return [(SourceSpec(root, dataset, name, model, found.get(name), published=published), ()) for name in names]
 
 
 def bench_jobs(
@@ -262,6 +280,7 @@ _POOLED = {
     "E_p_sym_mean",
     "coverage",
     "fps",
+    "fps_without_detector",
 }
 
 
@@ -269,16 +288,20 @@ def _pooled(runs: Sequence[tuple[Path, dict[str, Any]]]) -> dict[str, Any]:
     """Figures over all frames of several runs, from their folders and ``metrics.json``."""
     errors = np.vstack([read_errors(folder) for folder, _ in runs])
     targets = sum(figures["targets"] for _, figures in runs)
-    seconds = [figures["frames"] / fps for _, figures in runs if (fps := figures.get("fps"))]
-    frames = sum(figures["frames"] for _, figures in runs if figures.get("fps"))
     return {
         **metrics.summarise(metrics.PoseErrors(errors[:, 0], np.radians(errors[:, 1]), errors[:, 2])),
         "E_p_sym_mean": float(np.nanmean(errors[:, 3])) if np.isfinite(errors[:, 3]).any() else float("nan"),
         "clips": len(runs),
         "targets": targets,
         "coverage": sum(figures["valid"] for _, figures in runs) / targets if targets else None,
-        "fps": frames / sum(seconds) if seconds else None,
+        **{rate: _pooled_rate([figures for _, figures in runs], rate) for rate in ("fps", "fps_without_detector")},
     }
+
+
+def _pooled_rate(runs: Sequence[Mapping[str, Any]], rate: str) -> float | None:
+    """Frames per second over all runs that say theirs."""
+    known = [(figures["frames"], figures[rate]) for figures in runs if figures.get(rate)]
+    return sum(frames for frames, _ in known) / sum(frames / fps for frames, fps in known) if known else None
 
 
 def failures(outcomes: Sequence[Outcome]) -> list[str]:

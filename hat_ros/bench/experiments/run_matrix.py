@@ -19,13 +19,14 @@ from pathlib import Path
 from typing import Any
 
 from hat_ros.bench.source import SourceSpec
-from hat_ros.config import load_config
+from hat_ros.config import HatConfig, load_config
 from hat_ros.errors import RunError
 from hat_ros.io.provenance import code_hash, config_hash, input_hash
 from hat_ros.io.results import METRICS_FILE, RUN_FILE
 
-# One thread per run: timings are comparable, and N jobs use N cores.
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+# Backends that are networks.
+_NETWORKS = ("mask2former", "megapose", "picopose", "gigapose", "droid")
 
 
 GRAPH = "graph"
@@ -72,18 +73,30 @@ class Job:
             "limit": self.limit,
         }
 
-    def command(self, folder: Path) -> list[str]:
+    def threads(self, n_jobs: int) -> int:
+        """Numerical threads of the run beside others: one, so that timings are comparable and N jobs use N cores.
+
+        Networks share all cores among the jobs.
+        """
+        config = load_config(self.config, self.overrides) if self.poses is None else HatConfig()
+        backends = (config.segmentation.backend, config.hypotheses.backend, config.slam.backend)
+        return max(1, (os.cpu_count() or 1) // n_jobs) if set(backends) & set(_NETWORKS) else 1
+
+    def command(self, folder: Path, threads: int = 1) -> list[str]:
         """The command line that makes ``folder``."""
         if self.poses is not None:
             how = ["score", "--method", self.mode, "--poses", str(self.poses)]
         elif self.mode == GRAPH:
             how = ["replay", "--config", self.config]
         else:
-            how = ["track", "--mode", self.mode, "--config", self.config, "--threads", "1"]
+            how = ["track", "--mode", self.mode, "--config", self.config, "--threads", str(threads)]
+            how += ["--credits", "1"] if self.spec.published else []
         command = [sys.executable, "-m", "hat_ros.cli", *how, str(self.spec.path), "--out", str(folder)]
         command += ["--start", str(self.start), "--no-video", "--no-report", "--quiet", "--overwrite"]
         if self.spec.dataset:
             command += ["--dataset", self.spec.dataset, "--sequence", self.spec.sequence]
+            if self.spec.published:
+                command += ["--protocol", "published"]
         if self.spec.model is not None:
             command += ["--model", str(self.spec.model)]
         if self.spec.detections is not None:
@@ -141,7 +154,7 @@ def run_jobs(
     outcomes: dict[str, Outcome] = {}
     with ThreadPoolExecutor(n_jobs) as pool:
         try:
-            for future in as_completed([pool.submit(run_job, *item) for item in work]):
+            for future in as_completed([pool.submit(run_job, *item, n_jobs) for item in work]):
                 outcome = future.result()
                 outcomes[outcome.job.name] = outcome
                 if watch is not None:
@@ -152,12 +165,13 @@ def run_jobs(
     return [outcomes[job.name] for job in jobs]
 
 
-def run_job(job: Job, folder: Path, fingerprint: dict[str, Any]) -> Outcome:
-    """Run one job in a process of its own, unless a finished run with this fingerprint is there."""
+def run_job(job: Job, folder: Path, fingerprint: dict[str, Any], n_jobs: int = 1) -> Outcome:
+    """Run one job in a process of its own, beside others, unless a finished run with this fingerprint is there."""
     if (figures := _finished(folder, fingerprint)) is not None:
         return Outcome(job, folder, figures, reused=True)
-    environment = os.environ | dict.fromkeys(_ONE_THREAD, "1")
-    done = subprocess.run(job.command(folder), capture_output=True, text=True, env=environment)
+    threads = job.threads(n_jobs)
+    environment = os.environ | dict.fromkeys(_THREADS, str(threads))
+    done = subprocess.run(job.command(folder, threads), capture_output=True, text=True, env=environment)
     if done.returncode != 0:
         lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
         (folder.parent / f"{folder.name}.log").write_text(done.stderr, encoding="utf-8")

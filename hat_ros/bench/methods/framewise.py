@@ -34,19 +34,28 @@ class Hat:
         """See :meth:`HatTracker.step`."""
         return self._tracker.step(frame)
 
+    @property
+    def hypotheses(self) -> HypothesisStage:
+        """Stage 2 of the tracker."""
+        return self._tracker.hypotheses
+
     def finish(self) -> list[Estimate]:
         """Nothing: HAT never revises."""
         return []
 
 
 class Independent:
-    """Every frame for itself: its best-scored hypothesis, or no pose."""
+    """Every frame for itself: its best-scored hypothesis that is a pose at all, without the guard (as published)."""
 
     causal = True
     concurrent = True
 
     def __init__(self, config: HatConfig, target: Target, wrap: StageWrapper) -> None:
-        config = replace(config, keyframes=replace(config.keyframes, gap_frames=1))
+        config = replace(
+            config,
+            keyframes=replace(config.keyframes, gap_frames=1),
+            hypotheses=replace(config.hypotheses, guard=False),
+        )
         self._segmentation = wrap("segmentation", SegmentationStage(config, target))
         self._hypotheses = wrap("hypotheses", HypothesisStage(config, target))
 
@@ -62,7 +71,11 @@ class Independent:
 
 
 class Tracking:
-    """The previous pose, refined on each image; the best appearance where there is no track to follow."""
+    """The previous pose, refined on each image; the best appearance where there is no track to follow.
+
+    Refined by the hypothesis backend's own refiner where it has one (the paper's "MegaPose tracking"), else on its
+    contour.
+    """
 
     causal = True
     concurrent = False  # a step follows the pose of the one before
@@ -74,8 +87,10 @@ class Tracking:
             refinement=replace(config.refinement, enabled=True),
         )
         self._segmentation = wrap("segmentation", SegmentationStage(config, target))
-        self._hypotheses = wrap("hypotheses", HypothesisStage(config, target))
-        self._refinement = wrap("fusion", _LastPose(ContourRefiner(config.refinement, target)))
+        hypotheses = HypothesisStage(config, target)
+        self._hypotheses = wrap("hypotheses", hypotheses)
+        refiner = hypotheses.refiner or ContourRefiner(config.refinement, target)
+        self._refinement = wrap("fusion", _LastPose(refiner))
 
     def step(self, frame: Frame) -> Step:
         """Follow, or start afresh."""

@@ -32,6 +32,8 @@ _METHODS = {
     "observe": "framewise:Observe",
 }
 MODES = tuple(_METHODS)
+# Methods that look at every image for itself: where a protocol names target images, they see these alone.
+FRAMEWISE = ("independent",)
 
 
 def create_method(mode: str, config: HatConfig, target: Target, wrap: StageWrapper) -> Method:

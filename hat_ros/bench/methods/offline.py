@@ -2,9 +2,9 @@
 
 After the paper's "Causal and Offline Performance Comparison": motion by global bundle adjustment where the backend can
 (DROID-SLAM), the decoder's path traced back, one decision of the gate over the whole sequence, all poses optimised
-jointly, then dense refinement of every frame, which never leaves the basin of the anchors. Here the refined poses are
-measurements, as they are for the causal method: a last joint optimisation ties them to each other by the motion.
-Without refinement in the configuration the poses of the anchors stand.
+jointly, then dense refinement of every frame (:mod:`hat_ros.bench.methods.dense`), which never leaves the basin of the
+anchors. Here the refined poses are measurements, as they are for the causal method: a last joint optimisation ties them
+to each other by the motion. Without refinement in the configuration the poses of the anchors stand.
 """
 
 from __future__ import annotations
@@ -17,20 +17,17 @@ import cv2
 import numpy as np
 
 from hat_ros.array_types import Bool, Float, UInt8
+from hat_ros.bench.methods.dense import DenseRefinement
 from hat_ros.bench.methods.framewise import Hat
 from hat_ros.bench.methods.smoothing import smooth_anchors, smooth_measured
 from hat_ros.config import HatConfig
 from hat_ros.geometry import lie
 from hat_ros.motion.stage import suppress_background
-from hat_ros.refinement.contour_refiner import ContourRefiner
-from hat_ros.stages import PoseRefiner, whole_clip_motions_of
+from hat_ros.stages import whole_clip_motions_of
 from hat_ros.target.model import Target
 from hat_ros.tracker import StageWrapper, Step
-from hat_ros.tracking.image_fusion import is_supported, quality
 from hat_ros.types import Camera, Detection, Estimate, Frame, Motion, StateReason, TrackState
 
-# The paper's dense refinement rejects what lies further than this from the anchors.
-_SAME_BASIN_DEG = 90.0
 _NO_COVARIANCE = np.full((6, 6), np.nan)
 
 
@@ -43,7 +40,8 @@ class Offline:
     def __init__(self, config: HatConfig, target: Target, wrap: StageWrapper) -> None:
         self._config = config
         self._hat = Hat(config, target, wrap)
-        self._refiner = ContourRefiner(config.refinement, target) if config.refinement.enabled else None
+        hypotheses = self._hat.hypotheses
+        self._dense = DenseRefinement(config.refinement, target, hypotheses) if config.refinement.enabled else None
         self._whole_clip_motions = whole_clip_motions_of(config)
         self._steps: list[Step] = []
         self._images = _StoredClip(config.slam.masked)
@@ -52,7 +50,7 @@ class Offline:
         """Observe; the estimate in the returned step is the causal one."""
         step = self._hat.step(frame)
         self._steps.append(replace(step, detection=None))
-        if self._refiner is not None or self._whole_clip_motions is not None:
+        if self._dense is not None or self._whole_clip_motions is not None:
             self._images.append(frame, step.detection)
         return step
 
@@ -64,9 +62,12 @@ class Offline:
         motions = self._motions()
         result = smooth_anchors([step.candidates for step in steps], motions, self._config)
         T_final, covariances = result.T_cam_target, [_NO_COVARIANCE] * len(steps)
-        if self._refiner is not None:
+        if self._dense is not None:
             T_final = self._best_known(T_final, result.tied)
-            measured = [self._measured(self._refiner, index, T) for index, T in enumerate(T_final)]
+            measured = [
+                self._dense.measure(*self._images.load(index), T, self._steps[index].estimate)
+                for index, T in enumerate(T_final)
+            ]
             covariances = [covariance for _, covariance in measured]
             smooth = smooth_measured(np.stack([T for T, _ in measured]), motions, self._config)
             T_final = np.where(np.isfinite(smooth), smooth, T_final)
@@ -105,34 +106,6 @@ class Offline:
             if causal.state.has_pose:
                 out[index] = causal.T_cam_target
         return out
-
-    def _measured(self, refiner: PoseRefiner, index: int, T_decided: Float) -> tuple[Float, Float]:
-        """The pose (4, 4) that the image of a frame supports near the decided one, and its covariance; NaN: none.
-
-        What the causal method measured in the decided basin stands, unless the image clearly prefers another pose
-        there: it began closer, at the frame before.
-        """
-        causal, config = self._steps[index].estimate, self._config.refinement
-        T_causal = causal.T_cam_target if causal.state.has_pose else None
-        starts = [T_decided] if np.isfinite(T_decided).all() else []
-        if starts and T_causal is not None and (apart_deg := _apart_deg(T_causal, T_decided)) < _SAME_BASIN_DEG:
-            was_measured = causal.gap_frames == 0
-            if was_measured and apart_deg <= config.same_pose_deg:
-                return T_causal, causal.covariance
-            if apart_deg > config.same_pose_deg:
-                starts.insert(0 if was_measured else 1, T_causal)
-        best = None
-        for T_start in starts:
-            refined = refiner.refine(*self._images.load(index), T_start)
-            if quality(refined) > quality(best) + (config.switch_margin if is_supported(best, config) else 0.0):
-                best = refined
-        if is_supported(best, config):
-            return best.T_cam_target, best.covariance
-        return np.full((4, 4), np.nan), _NO_COVARIANCE
-
-
-def _apart_deg(T_a: Float, T_b: Float) -> float:
-    return float(np.degrees(lie.angle_between(T_a[:3, :3], T_b[:3, :3])))
 
 
 class _StoredClip(Sequence[tuple[Frame, "Detection | None"]]):

@@ -141,9 +141,7 @@ def keyframes_of(log: RunLog, config: HatConfig) -> list[Candidates]:
     out = []
     for group in log.candidates:
         due = schedule.update(len(group) > 0)
-        out.append(
-            Candidates(group.pose_rows[:keep], group.log_score[:keep], group.box_xyxy) if due else Candidates.none()
-        )
+        out.append(group.first(keep) if due else Candidates.none())
     return out
 
 

@@ -17,7 +17,7 @@ from hat_ros.app.timing import MEASURED, latency_summary, memory_summary
 from hat_ros.bench.evaluation.metrics import mask_summary
 from hat_ros.bench.evaluation.result_folder import complete_folder
 from hat_ros.bench.evaluation.silhouettes import Silhouettes
-from hat_ros.bench.methods.modes import create_method
+from hat_ros.bench.methods.modes import FRAMEWISE, create_method
 from hat_ros.bench.runs.folder import RunOptions, Watcher, no_frame_used, record_frames, result_folder
 from hat_ros.bench.source import Source, SourceSpec
 from hat_ros.config import HatConfig
@@ -99,7 +99,8 @@ def _run(
         closing(Silhouettes()) as silhouettes,
     ):
         try:
-            for done in pipeline.run(source.frames(options.start, options.limit, masks_given)):
+            frames = source.frames(options.start, options.limit, masks_given, options.mode in FRAMEWISE)
+            for done in pipeline.run(frames):
                 rows.append(done.measured())
                 if done.step.detection is not None or done.stage_ms["segmentation"] > 0.0:
                     silhouettes.remember(done.step)
@@ -124,5 +125,6 @@ def _run(
         raise RunError(no_frame_used(source.path, pipeline.refusals))
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     write_overlaps(folder, overlaps)
-    speed, memory = latency_summary(rows, finish_s), {"peak_memory_mib": peak_mib} | memory_summary(rows)
+    speed = latency_summary(rows, finish_s, sequential=pipeline.credits == 1)
+    memory = {"peak_memory_mib": peak_mib} | memory_summary(rows)
     return speed | memory | mask_summary(np.array(list(overlaps.values())))

@@ -21,8 +21,11 @@ from hat_ros.bench.datasets.importer import (
     open_dataset,
     with_annotation_boxes,
 )
+from hat_ros.bench.datasets.protocols import PROTOCOLS
 from hat_ros.bench.datasets.sequence import load_sequence, write_labels
+from hat_ros.bench.experiments.comparison import clips_of_dataset
 from hat_ros.bench.source import SourceSpec
+from hat_ros.config import load_config
 from hat_ros.errors import BagError, DatasetError, MeshError, UsageError
 from hat_ros.geometry import lie
 from hat_ros.io.bag_reader import BagReader
@@ -277,12 +280,96 @@ def test_malformed_spark_csv(spark_root, tmp_path, old, new, says):
         list(open_dataset("spark", spark_root, save_mesh(tmp_path / "cad.ply")))
 
 
-def test_spark_needs_a_model_and_one_csv(spark_root, tmp_path):
+def test_spark_needs_a_model_and_a_csv(spark_root, tmp_path):
     with pytest.raises(DatasetError, match="--model"):
         list(open_dataset("spark", spark_root))
     (spark_root / "labels.csv").unlink()
-    with pytest.raises(DatasetError, match="expected one CSV"):
+    with pytest.raises(DatasetError, match="expected a CSV"):
         list(open_dataset("spark", spark_root, save_mesh(tmp_path / "cad.ply")))
+
+
+def test_several_spark_csvs_are_read_together_and_may_not_contradict_each_other(spark_root, tmp_path):
+    model = save_mesh(tmp_path / "cad.ply")
+    header, *rows = (spark_root / "labels.csv").read_text().splitlines()
+    (spark_root / "labels.csv").write_text("\n".join([header, *(row for row in rows if "RT501" not in row)]))
+    (spark_root / "more.csv").write_text("\n".join([header, *rows]))
+    (spark_root / "notes.csv").write_text("who,when\nme,today\n")
+    recordings = list(open_dataset("spark", spark_root, model))
+    assert [(r.name, len(r)) for r in recordings] == [("RT500", 3), ("RT501", 3)]
+    changed = rows[0].replace(rows[0].split(",")[4], "99.0", 1)
+    (spark_root / "more.csv").write_text("\n".join([header, changed]))
+    with pytest.raises(DatasetError, match="has another pose in"):
+        list(open_dataset("spark", spark_root, model))
+
+
+# ---------------------------------------------------------------- published protocols
+
+
+def published(dataset, root, sequence, model=None):
+    return SourceSpec(root, dataset, sequence, model, published=True).open().recording
+
+
+def test_the_published_split_of_spark_alone_whatever_else_the_csv_lists(spark_root, tmp_path):
+    model = save_mesh(tmp_path / "cad.ply")
+    path = spark_root / "labels.csv"
+    header, *rows = path.read_text().splitlines()
+    beyond = [row.replace("RT501", "RT600") for row in rows if "RT501" in row]
+    path.write_text("\n".join([header, *(row for row in rows if "RT501" not in row), *beyond]))
+    clips = clips_of_dataset("spark", spark_root, model, [], published=True)
+    assert [spec.name for spec, _ in clips] == ["RT500"]
+    path.write_text("\n".join([header, *beyond]))
+    with pytest.raises(DatasetError, match=r"published split.*--protocol none"):
+        clips_of_dataset("spark", spark_root, model, [], published=True)
+
+
+def test_published_shirt_keeps_the_lens_and_boxes_the_corners_of_the_cad_model(shirt_root, tmp_path):
+    cad = tmp_path / "cad.ply"
+    trimesh.creation.icosphere(radius=0.4).export(cad)
+    recording = published("shirt", shirt_root, "roe1_synthetic", cad)
+    usual = SourceSpec(shirt_root, "shirt", "roe1_synthetic", cad).open().recording
+    assert usual.distortion.any() and not recording.distortion.any()
+    item, T = recording.files[1], recording.files[1].T_cam_target
+    vertices = load_target(cad).vertices_m
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * vertices.max(axis=0)
+    uv = recording.camera.project(corners @ T[:3, :3].T + T[:3, 3])
+    np.testing.assert_allclose(item.box_xyxy, np.concatenate([uv.min(axis=0), uv.max(axis=0)]), atol=1e-6)
+
+
+def test_published_ycbv_asks_for_poses_at_the_targets_alone(bop_root):
+    source = SourceSpec(bop_root, "ycbv", "000048_obj5", published=True).open()
+    assert [frame.scored for frame in source.frames()] == [False, True, False]
+    assert [frame.stamp_ns for frame in source.frames(scored_only=True)] == [stamp_of(1)]
+    plain = SourceSpec(bop_root, "ycbv", "000048_obj5").open()
+    assert all(frame.scored for frame in plain.frames())
+
+
+@pytest.mark.parametrize("preset", ["mega_hat", "pico_hat", "default"])
+@pytest.mark.parametrize("dataset", PROTOCOLS)
+def test_the_settings_of_every_profile_fit_every_preset(dataset, preset):
+    config = load_config(preset, PROTOCOLS[dataset].settings)
+    assert config.slam.masked == (dataset in ("spark", "swisscube"))
+    assert config.segmentation.pose_region == ("box" if dataset == "swisscube" else "detection")
+
+
+def test_a_cad_model_with_other_axes_than_the_labels_is_turned_into_theirs(sequence, tmp_path):
+    T_label_cad = lie.transform(lie.so3_exp(np.array([np.pi / 2, 0, 0.08])), np.array([0.0, 0.03, -0.046]))
+    labels = json.loads((sequence / "labels.json").read_text())
+    upright = load_target(sequence / labels["mesh"]).vertices_m
+    cad = trimesh.load(sequence / labels["mesh"], force="mesh")
+    cad.apply_transform(np.linalg.inv(T_label_cad))
+    cad.apply_scale(1000.0)
+    cad.export(tmp_path / "turned.ply")
+    stated = {"mesh": "turned.ply", "unit_scale": 0.001, "T_label_cad": T_label_cad.tolist()}
+    (tmp_path / "target.yaml").write_text(json.dumps(stated))
+    found = load_target(tmp_path / "target.yaml").vertices_m
+    np.testing.assert_allclose(found[np.lexsort(found.round(5).T)], upright[np.lexsort(upright.round(5).T)], atol=1e-6)
+    recording = replace(load_sequence(sequence), target_path=tmp_path / "target.yaml")
+    with_axes = check_picture(recording)
+    (tmp_path / "target.yaml").write_text(json.dumps(stated | {"T_label_cad": np.eye(4).tolist()}))
+    assert (with_axes != check_picture(recording)).any()
+    (tmp_path / "target.yaml").write_text(json.dumps(stated | {"T_label_cad": [[2, 0], [0, 1]]}))
+    with pytest.raises(MeshError, match="T_label_cad must be four rows"):
+        load_target(tmp_path / "target.yaml")
 
 
 # ---------------------------------------------------------------- shirt
