@@ -48,7 +48,8 @@ class HypothesisStage:
         Raises:
             CandidateError: the backend returned a score or pose that is not finite and ``hypotheses.guard`` is off.
         """
-        healthy = prior is not None and prior.healthy
+        # A body of revolution turns under outlines and light that stay: its track is held against images alone often.
+        healthy = prior is not None and prior.healthy and not len(self._symmetry.axes)
         self._observe(detection)
         failed = self._changed and (prior is None or not prior.supported)
         n_missed = self._cadence.missed(frame.stamp_ns)

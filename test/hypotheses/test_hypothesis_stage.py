@@ -28,9 +28,9 @@ def _detection(left, right):
     return Detection(mask)
 
 
-def _asked(monkeypatch, detections, prior=None):
+def _asked(monkeypatch, detections, prior=None, symmetry=Symmetry()):  # noqa: B008
     monkeypatch.setattr(hypothesis_stage, "create_backend", lambda *_: _Backend())
-    monkeypatch.setattr(hypothesis_stage, "symmetry_of", lambda target: Symmetry())
+    monkeypatch.setattr(hypothesis_stage, "symmetry_of", lambda target: symmetry)
     stage = HypothesisStage(HatConfig(keyframes=KeyframeConfig(gap_frames=6, settled_factor=3)), None)
     image = np.zeros((64, 64, 3), np.uint8)
     frames = [Frame(i + 1, image, CAMERA) for i in range(len(detections))]
@@ -122,3 +122,12 @@ def test_of_equal_orientations_the_one_nearest_to_the_track_is_given(monkeypatch
     for best, other in found:
         np.testing.assert_allclose(best[:3, :3], lie.so3_exp(np.array([0, 0, np.pi if tracked else 0.0])), atol=1e-12)
         assert lie.angle_between(other[:3, :3], best[:3, :3]) < np.radians(46)
+
+
+def test_the_track_of_a_body_of_revolution_is_never_settled(monkeypatch):
+    row = np.array([0, 0, 5, 0, 0, 0, 1.0])
+    prior = PosePrior(1, row, row, healthy=True, supported=True)
+    steady = 60 * [_detection(8, 40)]
+    assert np.diff(_asked(monkeypatch, steady, prior)).max() == 18
+    free = Symmetry(axes=np.array([[0, 0, 1.0]]))
+    assert set(np.diff(_asked(monkeypatch, steady, prior, free))) == {6}
