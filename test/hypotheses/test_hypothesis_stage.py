@@ -57,6 +57,7 @@ def test_the_backend_sees_the_region_that_is_asked_for(monkeypatch, region, silh
             return DECIDED
 
     monkeypatch.setattr(hypothesis_stage, "create_backend", lambda *_: Watching())
+    monkeypatch.setattr(hypothesis_stage, "symmetry_of", lambda target: Symmetry())
     config = HatConfig(segmentation=SegmentationConfig(pose_region=region, box_padding=0.125))
     whole = _detection(8, 40)
     whole.mask[8:20, 8:20] = False
