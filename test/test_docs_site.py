@@ -158,7 +158,7 @@ def test_launch_arguments_and_node_parameters_are_in_the_reference():
     page = GENERATE.fill(read(ROOT / "docs" / "parameters.md"))
     for name, (_, doc) in params._RUN_OPTIONS.items():
         assert re.search(rf"\| `{name}` \| `.*` \| {re.escape(doc)} \|", page)
-    assert "| `camera_info` | `/camera_info` |" in page
+    assert "| `camera_info` | `camera_info` |" in page
 
 
 def test_encodings_and_formats_of_the_cameras_page_are_those_that_are_read():

@@ -64,6 +64,11 @@ class CameraConfig:
         level="basic",
         choices=("auto", "8", "9", "10", "11", "12", "13", "14", "15", "16"),
     )
+    transport: str = option(
+        "auto",
+        "live: raw (the topic image), compressed (image/compressed), or auto (what is published; raw if both are)",
+        choices=("auto", "raw", "compressed"),
+    )
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ class Wire(StageWire, ImageWire, PoseWire):
     """Encodes everything that the graph sends; :meth:`ros` and :meth:`bag` choose the family of messages."""
 
     def diagnostics(self, stamp_ns: int, name: str, level: int, text: str, values: dict[str, Any]) -> Any:
-        """DiagnosticArray with one status; ``level`` is 0 OK, 1 WARN, 2 ERROR."""
+        """DiagnosticArray with one status; ``level`` is 0 OK, 1 WARN, 2 ERROR, 3 STALE."""
         key_value = self._class("diagnostic_msgs/msg/KeyValue")
         status = self._class("diagnostic_msgs/msg/DiagnosticStatus")(
             level=bytes([level]),

@@ -1,4 +1,7 @@
-"""Names, types and table columns of every topic (``docs/topics.md``); bags need them without any middleware."""
+"""Names, types and table columns of every topic (``docs/topics.md``); bags need them without any middleware.
+
+Names are those in the default namespace and in bags; see :func:`relative`.
+"""
 
 from __future__ import annotations
 
@@ -54,6 +57,15 @@ TYPES: dict[str, str] = {
     READY: "std_msgs/msg/Header",
     END_OF_STREAM: "std_msgs/msg/Header",
 }
+
+# Topics of the whole machine, the same in every namespace, as the tools that read them expect.
+ABSOLUTE = (TF, DIAGNOSTICS)
+
+
+def relative(topic: str) -> str:
+    """The topic as a node asks for it: relative to its namespace, unless it is one of the whole machine."""
+    return topic if topic in ABSOLUTE else topic.removeprefix("/")
+
 
 # What a result bag holds: everything that the graph sends, images excepted.
 RECORDED = (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -17,10 +16,16 @@ from hat_ros.io import topics
 from hat_ros.io.messages import Wire, message_class
 from hat_ros.ros import qos
 
-OK, WARN, ERROR = 0, 1, 2
+OK, WARN, ERROR, STALE = 0, 1, 2, 3
 # Begins what a node reports while it works on something that takes long, so that it is not given up meanwhile.
 BUSY = "busy: "
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+
+
+def prefix_of(node: Node) -> str:
+    """What the names in ``/diagnostics`` begin with: ``hat: ``, and the namespace where there is one."""
+    namespace = node.get_namespace().strip("/")
+    return f"hat: {namespace}/" if namespace else "hat: "
 
 
 class Diagnostics:
@@ -28,17 +33,19 @@ class Diagnostics:
 
     Args:
         node: the node.
+        name: what it is called, behind its namespace.
         wire: encodes messages.
         values: gives the figures that go with the text.
 
     Attributes:
-        level: 0 OK, 1 WARN, 2 ERROR.
+        level: 0 OK, 1 WARN, 2 ERROR, 3 STALE.
         text: one sentence.
     """
 
-    def __init__(self, node: Node, wire: Wire, values: Callable[[], dict[str, Any]]) -> None:
-        self._name = f"hat: {node.get_name()}"
+    def __init__(self, node: Node, name: str, wire: Wire, values: Callable[[], dict[str, Any]]) -> None:
+        self._name = f"{prefix_of(node)}{name}"
         self._log = node.get_logger()
+        self._clock = node.get_clock()
         self._wire, self._values = wire, values
         self.level, self.text = OK, "unconfigured"
         self._publisher = node.create_publisher(
@@ -53,7 +60,8 @@ class Diagnostics:
 
     def publish(self) -> None:
         """Send the state as it is, with the figures of now."""
-        message = self._wire.diagnostics(time.time_ns(), self._name, self.level, self.text, self._values())
+        stamp_ns = self._clock.now().nanoseconds  # of /clock, with use_sim_time
+        message = self._wire.diagnostics(stamp_ns, self._name, self.level, self.text, self._values())
         self._publisher.publish(message)
 
     def wait_for_readers(self, timeout_s: float) -> None:

@@ -15,6 +15,8 @@ from hat_ros.io import topics
 from hat_ros.io.messages import message_class
 from hat_ros.ros import qos
 
+# Begins the names of our nodes.
+PREFIX = "hat_"
 # Each event is an entity more in every wait; between our own nodes readiness already tells what does not fit.
 _NO_EVENTS = SubscriptionEventCallbacks(use_default_callbacks=False)
 # Latched messages that are kept for a node which is not active yet: as many as its readers' queues hold.
@@ -54,7 +56,7 @@ class Endpoints:
             readers = (*readers, "recorder")
         publisher = self._node.create_lifecycle_publisher(
             message_class(topics.TYPES[topic]),
-            topic,
+            topics.relative(topic),
             profile or qos.profile_of(topic, self._live),
             event_callbacks=_NO_PUBLISHER_EVENTS,
         )
@@ -99,7 +101,7 @@ class Endpoints:
         receiver: Callable[..., None] = receive_with_info if with_info else receive
         self._inputs[topic] = self._node.create_subscription(
             message_class(topics.TYPES[topic]),
-            topic,
+            topics.relative(topic),
             receiver,
             profile,
             event_callbacks=_NO_EVENTS if required else None,
@@ -135,8 +137,8 @@ class Endpoints:
     def _readers(self, topic: str) -> list[str]:
         latched = qos.is_latched(topic)
         return [
-            info.node_name
-            for info in self._node.get_subscriptions_info_by_topic(topic)
+            info.node_name.removeprefix(PREFIX)
+            for info in self._node.get_subscriptions_info_by_topic(topics.relative(topic))
             # A reader that asks for latched messages where there are none is never matched.
             if latched or info.qos_profile.durability != DurabilityPolicy.TRANSIENT_LOCAL
         ]

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -16,7 +19,8 @@ OPENCV_THREADS = "OPENCV_FOR_THREADS_NUM"
 
 # Eight processes with the segment of fastdds.xml; containers often have 64 MiB in all.
 _AMPLE_SHARED_BYTES = 8 * 64 * 2**20
-# malloc.h
+# prctl.h, malloc.h
+_PR_SET_PDEATHSIG = 1
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 
 
@@ -47,6 +51,13 @@ def keep_large_blocks() -> None:
         mallopt(_M_TRIM_THRESHOLD, 256 * 2**20)
 
 
+def end_with_parent() -> None:
+    """Let the kernel send SIGTERM when the parent is gone, also in the middle of something long; Linux only."""
+    prctl = getattr(ctypes.CDLL(None), "prctl", None)
+    if prctl is not None:
+        prctl(_PR_SET_PDEATHSIG, int(signal.SIGTERM))
+
+
 def leave_cores_to_stages() -> None:
     """One thread for OpenCV, unless the environment sets the number: stages and frames in flight are the threads.
 
@@ -57,8 +68,26 @@ def leave_cores_to_stages() -> None:
 
 
 def prepare_environment() -> None:
-    """Defaults for what the user has not set: our Fast DDS profile, and discovery on this machine only."""
+    """Our Fast DDS profile for this process, unless the user has set one."""
     profile = profile_path()
     if profile is not None:
         os.environ.setdefault(PROFILE, str(profile))
+
+
+@contextlib.contextmanager
+def replay_environment() -> Iterator[None]:
+    """For a graph that concerns nobody else: our profile, and discovery on this machine only, unless the user set them.
+
+    What the process does afterwards, and what it starts then, finds the environment as it was.
+    """
+    before = {name: os.environ.get(name) for name in (PROFILE, RANGE)}
+    prepare_environment()
     os.environ.setdefault(RANGE, "LOCALHOST")
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from hat_ros.ros.session import Session
 from hat_ros.ros.stage_node import StageSession
 from hat_ros.target.exact_symmetry import symmetry_of
 from hat_ros.tracker import choose_fusion
-from hat_ros.types import Camera, Detection, Estimate, Frame
+from hat_ros.types import Camera, Detection, Estimate, Frame, TrackState
 
 # Without a refiner only the frame's stamp counts, so no image is sent here.
 _NO_CAMERA = Camera(np.eye(3), 1, 1)
@@ -37,10 +38,14 @@ class FusionSession(StageSession):
         super().__init__(node, self._stage, (topics.SLAM_STATE, topics.SELECTION, *images))
         self._wire = node.wire
         self._estimate: Estimate | None = None
+        self._log = node.get_logger()
+        self._pose_hz, self._rated = 0.0, (time.monotonic(), 0)
         readers = ("hypotheses", "slam") if config.prior.enabled else ()
         self._status = node.endpoints.output(topics.STATUS, "segmentation", *readers)
-        frame_id = settings.target_frame_id or target.name
-        self._pose = PoseOutput(node.endpoints, node.wire, frame_id, config.graph.publish_initialising)
+        frame_id, graph = settings.target_frame_id or target.name, config.graph
+        self._pose = PoseOutput(
+            node.endpoints, node.wire, frame_id, graph.publish_initialising, publish_tf=settings.publish_tf
+        )
         self._resumed_epoch = -1
 
     def step(self, joined: JoinedFrame) -> None:
@@ -54,11 +59,25 @@ class FusionSession(StageSession):
         selection = messages.selection_from(joined.items[topics.SELECTION])
         estimate = self._stage.update(frame, detection, motion, selection)
         self._pose.publish(joined.frame_id, estimate)
+        self._log_change(estimate)
         self._estimate = estimate
         self._status.publish(self._wire.status(joined.frame_id, estimate, admitted))
         up_to = known_up_to(estimate.order, estimate.free_axes)
         words = f"{estimate.reason.words}; {up_to}" if up_to else estimate.reason.words
         self._diagnostics.report(OK, f"{estimate.state.name.lower()}: {words}")
+
+    def _log_change(self, estimate: Estimate) -> None:
+        before = TrackState.UNINITIALISED if self._estimate is None else self._estimate.state
+        if estimate.state != before:
+            log = self._log.warning if estimate.state == TrackState.LOST else self._log.info
+            log(f"{before.name.lower()} -> {estimate.state.name.lower()}: {estimate.reason.words}")
+
+    def every_second(self) -> None:
+        """Measure the rate of poses."""
+        super().every_second()
+        now, n_poses = time.monotonic(), self._pose.n_published
+        self._pose_hz = (n_poses - self._rated[1]) / (now - self._rated[0])
+        self._rated = (now, n_poses)
 
     def values(self) -> dict[str, Any]:
         """Figures for diagnostics; the smaller the margin, the more ambiguous the orientation."""
@@ -66,7 +85,7 @@ class FusionSession(StageSession):
             return super().values()
         e = self._estimate
         own = {"state": int(e.state), "reason": int(e.reason), "margin": e.margin, "gap_frames": e.gap_frames}
-        return {**super().values(), **own}
+        return {**super().values(), **own, "pose_hz": f"{self._pose_hz:.1f}"}
 
 
 def _image(joined: JoinedFrame) -> tuple[Frame, Detection | None]:

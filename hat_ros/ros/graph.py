@@ -24,7 +24,7 @@ from hat_ros.core.refusals import Refusals
 from hat_ros.errors import ConfigError
 from hat_ros.io.bag_reader import BagReader
 from hat_ros.ros.domain import reserved_domain
-from hat_ros.ros.environment import keep_large_blocks, prepare_environment
+from hat_ros.ros.environment import keep_large_blocks, replay_environment
 from hat_ros.ros.replay_run import Progress, ReplayRun
 from hat_ros.ros.stage_processes import STAGES, StageProcesses
 
@@ -104,9 +104,9 @@ def replay(
     if credits is not None:
         config = replace(config, graph=replace(config.graph, credits_replay=credits))
     reader = BagReader(bag, image_topic=image_topic, camera_info_topic=camera_info_topic, camera_config=config.camera)
-    prepare_environment()
     keep_large_blocks()
     with contextlib.ExitStack() as stack:
+        stack.enter_context(replay_environment())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="hat_replay_")))
         domain = stack.enter_context(reserved_domain(domain_id))
         config_file = folder / "config.yaml"

@@ -22,7 +22,7 @@ from hat_ros.io import topics
 from hat_ros.io.messages import Wire, message_class
 from hat_ros.ros import qos
 from hat_ros.ros.diagnostics import ERROR, OK, STEADY, Diagnostics
-from hat_ros.ros.endpoints import Endpoints
+from hat_ros.ros.endpoints import PREFIX, Endpoints
 from hat_ros.ros.params import declare_parameters
 from hat_ros.ros.session import Session
 
@@ -34,7 +34,9 @@ SessionT_co = TypeVar("SessionT_co", bound=Session, covariant=True)
 
 
 class HatNode(LifecycleNode, ABC, Generic[SessionT_co]):
-    """A lifecycle node in ``/hat``; what it does is in its :class:`~hat_ros.ros.session.Session`.
+    """A lifecycle node, ``hat_`` and its ``NAME``; what it does is in its :class:`~hat_ros.ros.session.Session`.
+
+    It lives in the namespace that it is started with, and all its topics but those of the whole machine do, too.
 
     Attributes:
         settings: the values of all parameters.
@@ -52,8 +54,7 @@ class HatNode(LifecycleNode, ABC, Generic[SessionT_co]):
 
     def __init__(self, *, context: Context | None = None, parameters: dict[str, Any] | None = None) -> None:
         super().__init__(
-            self.NAME,
-            namespace="/hat",
+            f"{PREFIX}{self.NAME}",
             context=context,
             parameter_overrides=[Parameter(name, value=value) for name, value in (parameters or {}).items()],
             automatically_declare_parameters_from_overrides=True,
@@ -65,8 +66,10 @@ class HatNode(LifecycleNode, ABC, Generic[SessionT_co]):
         self._session: SessionT_co | None = None
         self._announced = False
         self.endpoints = Endpoints(self, self.settings.live, self.settings.recorded, self.guarded, lambda: self.active)
-        self.diagnostics = Diagnostics(self, self.wire, self.values)
-        self._ready = self.create_publisher(message_class(topics.TYPES[topics.READY]), topics.READY, qos.LATCH)
+        self.diagnostics = Diagnostics(self, self.NAME, self.wire, self.values)
+        self._ready = self.create_publisher(
+            message_class(topics.TYPES[topics.READY]), topics.relative(topics.READY), qos.LATCH
+        )
         self.create_timer(1.0, self._every_second, clock=STEADY)
         self._announcer = self.create_timer(0.02, self._announce, clock=STEADY)
 
@@ -129,10 +132,14 @@ class HatNode(LifecycleNode, ABC, Generic[SessionT_co]):
         """Tell the others; said again, it means that what was under way here is lost. Without a stamp: not ready."""
         self._ready.publish(self.wire.header(time.time_ns() if ready else 0, self.NAME))
 
-    def _every_second(self) -> None:
+    def check_supervisor(self) -> None:
+        """Fail when the process that had started this one is gone."""
         supervisor = self.settings.supervisor_pid
         if supervisor and os.getppid() != supervisor:
             self.failure = RunError(f"process {supervisor}, which had started this node, is gone")
+
+    def _every_second(self) -> None:
+        self.check_supervisor()
         if self.active:
             self.guarded(self.session.every_second)
         self.diagnostics.publish()

@@ -25,7 +25,8 @@ _RUN_OPTIONS: dict[str, tuple[Any, str]] = {
     "config": ("default", "preset (default, mega_hat, ...) or YAML file; other parameters override it"),
     "target": ("", "CAD model (obj, ply, stl, glb) or target.yaml"),
     "target_frame_id": ("", "name of the target (CAD) frame, empty = the model's name"),
-    "live": (False, "a camera that cannot wait: one frame in flight, the newest wins, drops are counted"),
+    "publish_tf": (True, "publish the target's pose on /tf, too, where tf2_msgs is present"),
+    "live": (False, "a camera that cannot wait: few frames in flight, the newest wins, drops are counted"),
     "autostart": (True, "configure and activate by itself, without a lifecycle manager"),
     "exit_at_end": (False, "end the process after /hat/end_of_stream"),
     "recorded": (False, "wait for the recorder before reporting ready"),
@@ -44,6 +45,7 @@ class Settings:
         config_name: the preset or file that it started from.
         target: path of the CAD model or ``target.yaml``.
         target_frame_id: name of the target frame, empty = the model's name.
+        publish_tf: the pose goes out on ``/tf``, too.
         live: the source cannot wait.
         autostart: configure and activate without a manager.
         exit_at_end: the process ends after the end of the stream.
@@ -56,6 +58,7 @@ class Settings:
     config_name: str
     target: str
     target_frame_id: str
+    publish_tf: bool
     live: bool
     autostart: bool
     exit_at_end: bool
@@ -94,7 +97,7 @@ def declare_parameters(node: Node, extra: dict[str, tuple[Any, str]] | None = No
         if name not in names:
             close = difflib.get_close_matches(name, names, n=1)
             advice = f"did you mean '{close[0]}'?" if close else "see `ros2 param list` for the known ones"
-            raise ConfigError(f"node {node.get_name()}: unknown parameter '{name}': {advice}")
+            raise ConfigError(f"node {node.get_name().removeprefix('hat_')}: unknown parameter '{name}': {advice}")
     run = {name: _checked(name, given.get(name, default), default) for name, (default, _) in run_options.items()}
     config = _configure(run["config"], {name: given[name] for name in given if name not in run_options})
     for name, (_, doc) in run_options.items():

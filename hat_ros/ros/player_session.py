@@ -15,7 +15,7 @@ from hat_ros.errors import ConfigError
 from hat_ros.io import messages, topics
 from hat_ros.io.bag_reader import BagReader, Packet
 from hat_ros.ros import qos
-from hat_ros.ros.diagnostics import STEADY
+from hat_ros.ros.diagnostics import STEADY, prefix_of
 from hat_ros.ros.node import HatNode
 from hat_ros.ros.playback import Playback
 from hat_ros.ros.session import Session
@@ -45,6 +45,7 @@ class PlayerSession(Session):
         choice = {name: extra[name] for name in ("rate", "first_frame", "max_frames")}
         self.playback = Playback(self._bag, self._config, live=settings.live, **choice)
         self.texts: dict[str, str] = {}
+        self._prefix = prefix_of(node)
         self._is_open = False
         self._wait_for: list[str] = extra["wait_for"]
         self._ready_nodes: set[str] = set()
@@ -82,7 +83,9 @@ class PlayerSession(Session):
     def on_diagnostics(self, message: Any) -> None:
         """Frames refused after the last status are known from here alone; and why a node is not ready."""
         for status in message.status:
-            name = status.name.removeprefix("hat: ")
+            if not status.name.startswith(self._prefix):
+                continue
+            name = status.name.removeprefix(self._prefix)
             if not self._is_open and self.texts.get(name) != status.message:
                 self.playback.progress_s = time.monotonic()  # a node with a new text is at work
             self.texts[name] = status.message

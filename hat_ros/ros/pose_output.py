@@ -20,18 +20,25 @@ class PoseOutput:
         wire: encodes messages.
         target_frame_id: name of the target (CAD) frame.
         publish_initialising: option ``graph.publish_initialising``.
+        publish_tf: also as a transform on ``/tf``.
+
+    Attributes:
+        n_published: poses sent so far.
     """
 
-    def __init__(self, endpoints: Endpoints, wire: Wire, target_frame_id: str, publish_initialising: bool) -> None:
+    def __init__(
+        self, endpoints: Endpoints, wire: Wire, target_frame_id: str, publish_initialising: bool, *, publish_tf: bool
+    ) -> None:
         self._wire = wire
         self._target_frame_id = target_frame_id
         self._publish_initialising = publish_initialising
         self._version = 0
+        self.n_published = 0
         self._pose = endpoints.output(topics.TARGET_POSE)
         self._with_covariance = endpoints.output(topics.TARGET_POSE_WITH_COVARIANCE)
         self._alignment = endpoints.output(topics.ALIGNMENT)
         self._alignment_transform = endpoints.output(topics.ALIGNMENT_TRANSFORM)
-        self._tf = endpoints.output(topics.TF) if find_spec("tf2_msgs") else None
+        self._tf = endpoints.output(topics.TF) if publish_tf and find_spec("tf2_msgs") else None
 
     def publish(self, frame_id: str, estimate: Estimate) -> None:
         """Publish the alignment if it changed, and the pose if it was confirmed or others are asked for."""
@@ -40,6 +47,7 @@ class PoseOutput:
             self._publish_pose(frame_id, estimate)
 
     def _publish_pose(self, frame_id: str, estimate: Estimate) -> None:
+        self.n_published += 1
         stamp_ns, row, make = estimate.stamp_ns, estimate.pose_row, self._wire
         self._pose.publish(make.pose(stamp_ns, frame_id, row))
         self._with_covariance.publish(make.pose_with_covariance(stamp_ns, frame_id, row, estimate.covariance))

@@ -14,9 +14,10 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
 from hat_ros.errors import HatError
-from hat_ros.ros.environment import keep_large_blocks, leave_cores_to_stages, prepare_environment
+from hat_ros.ros.environment import end_with_parent, keep_large_blocks, leave_cores_to_stages, prepare_environment
 from hat_ros.ros.node import HatNode
 from hat_ros.ros.session import Session
+from hat_ros.ros.shared_memory import free_abandoned
 
 
 class StopRequest:
@@ -61,6 +62,7 @@ def close(executor: SingleThreadedExecutor, nodes: Sequence[HatNode[Session]]) -
 
 def main(node_classes: Sequence[type[HatNode[Session]]], args: Sequence[str] | None = None) -> int:
     """Entry point of every node process: 0 done, 1 failed, 2 bad input, with one sentence on stderr."""
+    free_abandoned()
     prepare_environment()
     keep_large_blocks()
     leave_cores_to_stages()
@@ -77,6 +79,11 @@ def main(node_classes: Sequence[type[HatNode[Session]]], args: Sequence[str] | N
             node = node_class(context=context)
             nodes.append(node)
             executor.add_node(node)
+            if node.settings.supervisor_pid:
+                end_with_parent()
+                node.check_supervisor()  # it may have ended before
+                if node.failure is not None:
+                    raise node.failure
             if node.settings.autostart:
                 node.start()
         stop.starting = False

@@ -37,6 +37,13 @@ _OF = {
 }
 
 
+def camera_profile(live: bool, best_effort: bool) -> QoSProfile:
+    """What a camera's topic is read with: live, as reliable as the camera is."""
+    if not live:
+        return IN_REPLAY
+    return DEBUG if best_effort else _profile(_RELIABLE, 1, _VOLATILE)
+
+
 def profile_of(topic: str, live: bool = False) -> QoSProfile:
     """Profile of a topic as its publisher offers it; cameras' topics depend on the mode."""
     return _OF.get(topic, IN_LIVE if live else IN_REPLAY)

@@ -14,6 +14,8 @@ from hat_ros.errors import FrameError, RunError
 from hat_ros.io import messages, topics
 from hat_ros.io.calibration import calibration_from
 from hat_ros.ros import qos
+from hat_ros.ros.camera_input import CameraInput
+from hat_ros.ros.camera_watch import CameraWatch
 from hat_ros.ros.diagnostics import OK, STEADY, WARN
 from hat_ros.ros.entrance import Entrance
 from hat_ros.ros.frames_in_flight import FramesInFlight
@@ -24,6 +26,11 @@ from hat_ros.segmentation.stage import SegmentationStage
 from hat_ros.tracking.prior import PriorBuffer
 from hat_ros.types import Frame, TrackState
 
+_TRANSPORTS = {
+    "auto": (topics.IMAGE, topics.IMAGE_COMPRESSED),
+    "raw": (topics.IMAGE,),
+    "compressed": (topics.IMAGE_COMPRESSED,),
+}
 _STAGES = {"hypotheses", "slam", "selector", "fusion"}
 
 
@@ -39,7 +46,7 @@ class SegmentationSession(Session):
         self._entrance = Entrance(live, annotated, config.camera.image_depth)
         self._config = config.graph
         self._rectified = config.camera.rectified
-        self._image_topic = node.resolve_topic_name(topics.IMAGE)
+        self._image_topic = node.resolve_topic_name(topics.relative(topics.IMAGE))
         # A record tells frames by their stamps: there none may come twice.
         self._in_flight = FramesInFlight(config.graph, live, restarts=live and not node.settings.recorded)
         self._epoch = 0
@@ -48,27 +55,32 @@ class SegmentationSession(Session):
         self._ready_nodes: set[str] = set()
         self._delay = ExtraDelay(node.NAME, config.graph.debug_stage_delay_ms)
         self._step_timer = StepTimer()
-        self._subscribe(annotated, live)
+        self._watch = CameraWatch()
+        self._images, self._infos = self._subscribe(annotated, live, config.camera.transport)
         readers = ("fusion",) if config.refinement.enabled else ()
         self._camera_info = node.endpoints.output(topics.HAT_CAMERA_INFO, "hypotheses", "slam", *readers)
         self._admission = node.endpoints.output(topics.ADMISSION, *sorted(_STAGES))
         self._frame = node.endpoints.output(topics.FRAME, "hypotheses", "slam", *readers)
-        self._service = node.create_service(Trigger, topics.RESET, self._on_reset)
+        self._service = node.create_service(Trigger, topics.relative(topics.RESET), self._on_reset)
         self._timer = node.create_timer(0.1, partial(node.guarded, self._check_time), clock=STEADY)
 
-    def _subscribe(self, annotated: bool, live: bool) -> None:
-        subscribe = self._node.endpoints.input
-        for topic in (topics.IMAGE, topics.IMAGE_COMPRESSED):
-            subscribe(topic, partial(self._on_image, topic), required=False, with_info=True)
-        subscribe(topics.CAMERA_INFO, self._on_camera_info, required=False)
+    def _subscribe(self, annotated: bool, live: bool, transport: str) -> tuple[CameraInput, CameraInput]:
+        node, endpoints = self._node, self._node.endpoints
+        subscribe = endpoints.input
+        images = CameraInput(node, endpoints, _TRANSPORTS[transport if live else "auto"], live, self._on_image)
+        infos = CameraInput(node, endpoints, (topics.CAMERA_INFO,), live, self._on_camera_info)
         if annotated:
             subscribe(topics.DETECTION_MASK, self._on_mask, profile=qos.IN_REPLAY, required=not live)
         subscribe(topics.STATUS, self._on_status)
         subscribe(topics.READY, self._on_ready, profile=qos.LATCH_READER, required=False)
+        return images, infos
 
     def every_second(self) -> None:
-        """Look again for a second camera, and for stages that are gone."""
+        """Look again for the camera, a second one, and for stages that are gone."""
         self._expect_one_camera()
+        if not self._node.settings.live:  # a replay has one who watches its processes
+            return
+        self._judge_camera()
         gone = self._node.endpoints.gone(topics.ADMISSION) if self._is_open else []
         if gone:
             self._ready_nodes.difference_update(gone)
@@ -80,16 +92,32 @@ class SegmentationSession(Session):
         Raises:
             RunError: there is one, in a replay.
         """
-        for topic in map(self._node.resolve_topic_name, (topics.IMAGE, topics.IMAGE_COMPRESSED)):
-            found = self._node.get_publishers_info_by_topic(topic)
-            if len(found) < 2:
-                continue
-            names = ", ".join(sorted(f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in found))
-            sentence = f"{topic} has {len(found)} publishers ({names}): stop all but one, or remap image"
-            if not self._node.settings.live:
-                raise RunError(sentence)
-            self._entrance.forget_numbers()  # those of several publishers do not belong together
-            self._diagnostics.report(WARN, sentence)
+        self._infos.follow()
+        names = self._images.follow()
+        if len(names) < 2:
+            return
+        topic = self._images.describe()
+        sentence = f"{topic} has {len(names)} publishers ({', '.join(names)}): stop all but one, or remap image"
+        if not self._node.settings.live:
+            raise RunError(sentence)
+        self._entrance.forget_numbers()  # those of several publishers do not belong together
+        self._diagnostics.report(WARN, sentence)
+
+    def _judge_camera(self) -> None:
+        """Say that the camera is silent, is back, or is faster than the graph."""
+        if self._images.topic is None:
+            self._diagnostics.report(WARN, f"no camera on {self._images.describe()}")
+        was_silent, silence = self._watch.is_silent, self._watch.silence()
+        if silence is not None:
+            self._diagnostics.report(silence[0], f"{silence[1]} on {self._images.describe()}")
+        if self._watch.is_silent != was_silent:
+            log = self._node.get_logger()
+            (log.info if was_silent else log.warning)(
+                f"{self._images.describe()}: {'back' if was_silent else 'silent'}"
+            )
+        overload = self._watch.overload(self._entrance.dropped_total)
+        if overload is not None:
+            (self._warn if self._watch.is_overloaded else self._node.get_logger().info)(overload)
 
     def close(self) -> None:
         """Drop the service and the timer."""
@@ -103,12 +131,15 @@ class SegmentationSession(Session):
             "admitted": self._in_flight.admitted,
             "dropped": self._entrance.dropped_total,
             "in_flight": in_flight,
+            "given_up": self._in_flight.given_up,
+            "image_age_s": f"{self._watch.age_s:.3f}",
             "refused": self._entrance.refusals.total,
             topics.REFUSED_REASONS: json.dumps(self._entrance.refusals.records()),
         }
         return counts | self._step_timer.values()
 
     def _on_image(self, topic: str, message: Any, info: dict[str, Any]) -> None:
+        self._watch.note_image()
         self._entrance.add_image(topic, message, info["publication_sequence_number"])
         self._pump()
 
@@ -116,7 +147,7 @@ class SegmentationSession(Session):
         self._entrance.add_mask(message)
         self._pump()
 
-    def _on_camera_info(self, message: Any) -> None:
+    def _on_camera_info(self, topic: str, message: Any, info: dict[str, Any]) -> None:
         calibration = calibration_from(message, self._image_topic, self._rectified)
         if calibration is None:
             self._diagnostics.report(
@@ -138,21 +169,15 @@ class SegmentationSession(Session):
 
     def _on_ready(self, message: Any) -> None:
         name, is_ready = message.frame_id, message.stamp.sec > 0  # of the wall clock; 0: not any more
-        if name in self._ready_nodes & _STAGES and self._is_open:
+        if self._node.settings.live and self._is_open and name in self._ready_nodes & _STAGES:
             self._lose(f"{name}: {'started again' if is_ready else 'stopped'}")
         (self._ready_nodes.add if is_ready else self._ready_nodes.discard)(name)
         self._pump()
 
     def _lose(self, what: str) -> None:
-        """A stage has lost its state and what was under way there: give that up at once, go on in a new epoch.
-
-        Raises:
-            RunError: in a replay, unless all has been answered.
-        """
+        """A stage has lost its state and what was under way there: give that up at once, go on in a new epoch."""
         lost = self._in_flight.give_up()
         sentence = f"{what}; {lost} frames were under way, a new epoch begins when all stages are ready"
-        if lost and not self._node.settings.live:
-            raise RunError(sentence)
         self._is_open = False
         self._new_epoch(resumed=self._last_state.is_confirmed)
         self._warn(sentence)
@@ -216,6 +241,8 @@ class SegmentationSession(Session):
 
     def _check_time(self) -> None:
         """A stage that does not answer: a replay ends, a live graph goes on with the next frame."""
+        if self._images.topic is None or self._infos.topic is None:
+            self._expect_one_camera()
         overdue = self._in_flight.overdue()
         if overdue is not None:
             self._node.fail(overdue)

@@ -1,4 +1,4 @@
-"""The node processes of a replay: started with their parameters, watched, and ended."""
+"""The node processes of a replay or of the live bench: started with their parameters, watched, and ended."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from typing import IO, Any
 import yaml
 
 from hat_ros.errors import ConfigError, HatError, InputError, RunError, StageTimeoutError
+from hat_ros.ros.endpoints import PREFIX
 from hat_ros.ros.timeouts import HANGS
 
 STAGES = ("segmentation", "hypotheses", "slam", "selector", "fusion")
@@ -31,6 +32,7 @@ class StageProcesses:
     def __init__(self, folder: Path, domain: int) -> None:
         self._folder, self._domain = folder, domain
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._started: dict[str, tuple[str, Path]] = {}
         self._logs: list[IO[bytes]] = []
         self._peak_mib: dict[str, float] = {}
         self._next_look_s = 0.0
@@ -53,15 +55,35 @@ class StageProcesses:
         supervised = {**parameters, "exit_at_end": True, "supervisor_pid": os.getpid()}
         content: dict[str, Any] = {"/**": {"ros__parameters": supervised}}
         for name, delay_ms in delays_ms.items():
-            content[f"/hat/{name}"] = {"ros__parameters": {"graph": {"debug_stage_delay_ms": float(delay_ms)}}}
+            content[f"/{PREFIX}{name}"] = {"ros__parameters": {"graph": {"debug_stage_delay_ms": float(delay_ms)}}}
         file.write_text(yaml.safe_dump(content), encoding="utf-8")
         modules = {name: f"{name}_node" for name in STAGES} if graph == "processes" else {"graph": "single"}
         for name, module in modules.items():
             self._start(name, module, file)
 
+    def add(self, name: str, module: str, parameters: dict[str, Any]) -> None:
+        """Start one more process beside the stages, such as a camera."""
+        file = self._folder / f"{name}.yaml"
+        content = {"/**": {"ros__parameters": {**parameters, "supervisor_pid": os.getpid()}}}
+        file.write_text(yaml.safe_dump(content), encoding="utf-8")
+        self._start(name, module, file)
+
+    def revive(self) -> list[str]:
+        """Start again what has died, as the launch file does: neither what ended well nor what was given bad input."""
+        ended = {name: process.poll() for name, process in self._processes.items()}
+        died = [name for name, code in ended.items() if code not in (None, 0, InputError.exit_code)]
+        for name in died:
+            self._start(name, *self._started[name])
+        return died
+
+    def pid(self, name: str) -> int:
+        """Process id of a process that was started."""
+        return self._processes[name].pid
+
     def _start(self, name: str, module: str, parameters: Path) -> None:
-        log = (self._folder / f"{name}.log").open("wb")
+        log = (self._folder / f"{name}.log").open("ab")
         self._logs.append(log)
+        self._started[name] = (module, parameters)
         self._processes[name] = subprocess.Popen(
             [sys.executable, "-m", f"hat_ros.ros.{module}", "--ros-args", "--params-file", str(parameters)]
             + ["--disable-external-lib-logs"],

@@ -233,7 +233,7 @@ def test_a_second_camera_on_the_same_topic_is_named(clean_bag, config, tmp_path)
         kind = messages.message_class(topics.TYPES[topics.IMAGE])
         other.create_publisher(kind, topics.IMAGE, 1)
         try:
-            with pytest.raises(RunError, match=r"/image has 2 publishers \(/hat/player, /other_camera\): stop"):
+            with pytest.raises(RunError, match=r"/image has 2 publishers \(/hat_player, /other_camera\): stop"):
                 replay(
                     clean_bag,
                     config,

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import re
 import time
+from functools import partial
 
 import pytest
-from live_nodes import KINDS, LiveNodes
+from live_nodes import KINDS, Camera, LiveNodes
 from rclpy.lifecycle import TransitionCallbackReturn
 from single_node import spin_until
 
 from hat_ros.errors import FrameError
+from hat_ros.io import topics
+from hat_ros.io.messages import message_class
+from hat_ros.ros import qos
+from hat_ros.ros.diagnostics import OK, STALE, WARN
 from hat_ros.types import TrackState
 
 pytestmark = pytest.mark.graph
@@ -183,3 +189,49 @@ def test_a_stamp_far_ahead_and_a_reset(started):
     estimates = graph.send(5)
     assert posed(estimates)[-1], "none is refused after a reset"
     assert estimates[-1].state in (TrackState.TRACKING, TrackState.COASTING)
+
+
+def diagnosed(graph):
+    return graph.entrance.diagnostics.level, graph.entrance.diagnostics.text
+
+
+def camera_of(graph, profile):
+    graph.camera.node.destroy_node()
+    graph.camera = Camera(graph.executor, profile)
+
+
+def follows(graph, profile):
+    session = graph.entrance.session
+    profiles = [followed._profile for followed in (session._images, session._infos)]
+    return all(found is not None and found.reliability == profile.reliability for found in profiles)
+
+
+def test_the_input_follows_the_camera(executor, clean_bag):
+    graph = LiveNodes(executor, clean_bag, **PATIENT)
+    graph.camera.node.destroy_node()
+    assert spin_until(executor, lambda: diagnosed(graph) == (WARN, "no camera on /image or /image/compressed"), 500)
+    best_effort = qos.DEBUG
+    for profile in (best_effort, qos.IN_REPLAY, best_effort):
+        camera_of(graph, profile)
+        assert spin_until(executor, partial(follows, graph, profile), turns=500)
+        graph.await_ready()
+        graph.calibrate()
+        assert posed(graph.send(4))[-1]
+    compressed = graph.camera.node.create_publisher(
+        message_class(topics.TYPES[topics.IMAGE_COMPRESSED]), topics.IMAGE_COMPRESSED, best_effort
+    )
+    spin_until(executor, lambda: False, turns=60)
+    assert compressed.get_subscription_count() == 0, "one transport, chosen once"
+    assert graph.entrance.values()["dropped"] == 0
+    assert spin_until(executor, lambda: diagnosed(graph)[0] == STALE, turns=500)
+    assert re.fullmatch(r"no image for [5-9]\.\d s on /image", diagnosed(graph)[1])
+    assert posed(graph.send(2))[-1]
+    assert spin_until(executor, lambda: diagnosed(graph)[0] == OK)
+    graph.close()
+
+
+def test_a_transport_that_is_asked_for_is_the_only_one(executor, clean_bag):
+    graph = LiveNodes(executor, clean_bag, **{"camera.transport": "compressed"})
+    assert spin_until(executor, lambda: diagnosed(graph) == (WARN, "no camera on /image/compressed"), turns=500)
+    assert graph.camera.image.get_subscription_count() == 0
+    graph.close()

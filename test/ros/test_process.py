@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 from rosbags.rosbag2 import Reader
@@ -65,3 +66,35 @@ def test_bad_parameters_are_one_sentence_and_exit_code_two():
         "node selector: unknown parameter 'selector.score_scal': did you mean 'selector.score_scale'?"
     )
     assert "Traceback" not in said
+
+
+ORPHAN = """
+import subprocess, sys, time
+child = subprocess.Popen([sys.executable, "-c", sys.argv[1]], stdout=subprocess.PIPE)
+assert child.stdout.readline() == b"up\\n"
+print(child.pid, flush=True)
+time.sleep(600)
+"""
+CHILD = """
+import time
+from pathlib import Path
+from hat_ros.ros.environment import end_with_parent
+end_with_parent()
+print("up", flush=True)
+time.sleep(600)
+"""
+
+
+def test_a_process_that_is_to_end_with_its_parent_does():
+    parent = subprocess.Popen([sys.executable, "-c", ORPHAN, CHILD], stdout=subprocess.PIPE)
+    child = int(parent.stdout.readline())
+    parent.kill()
+    parent.wait()
+    parent.stdout.close()
+    end = time.monotonic() + 10
+    while Path(f"/proc/{child}").exists() and time.monotonic() < end:
+        state = Path(f"/proc/{child}/stat").read_text().rsplit(")", 1)[1].split()[0]
+        if state == "Z":
+            break
+        time.sleep(0.05)
+    assert time.monotonic() < end

@@ -24,6 +24,7 @@ def test_stamps_that_step_back_begin_a_new_epoch_in_every_stage(executor, clean_
         node.start()
     entrance, camera = nodes[0], Camera(executor)
     assert spin_until(executor, lambda: not entrance.endpoints.unmatched() and camera.image.get_subscription_count())
+    assert spin_until(executor, camera.info.get_subscription_count)
     camera.info.publish(WIRE.camera_info(frames[0].stamp_ns, "cam", frames[0].camera))
     reported = []
     report = entrance.diagnostics.report
