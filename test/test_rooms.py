@@ -36,6 +36,7 @@ BENCH_FLOORS = (
     ("datasets",),
     ("synth", "source", "observations"),
     ("evaluation", "check_frames"),
+    ("live",),
     ("check", "check_picture"),
     ("methods",),
     ("runs",),

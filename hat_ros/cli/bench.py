@@ -178,10 +178,51 @@ def _add_bench(commands: Commands) -> None:
         help="a row for a method outside this package, from its file of poses (see `hat score`); {clip} in FILE stands "
         "for the clip's name (repeatable)",
     )
+    parser.add_argument(
+        "--live",
+        action="store_true",
+        help="instead: the live graph on one bag, with a camera that does not wait; rates, latencies, cost, faults",
+    )
+    parser.add_argument(
+        "--rates", type=_numbers, default=[30, 60, 120], metavar="LIST", help="--live: Hz (default: 30,60,120)"
+    )
+    parser.add_argument(
+        "--seconds", type=positive, default=20, metavar="S", help="--live: measured at each rate (default: 20)"
+    )
+    parser.add_argument(
+        "--graph", choices=("processes", "single"), default="processes", help="--live: five processes, or one"
+    )
     parser.set_defaults(command=_bench)
 
 
+def _bench_live(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from hat_ros.bench.live.tables import LiveBench
+    from hat_ros.cli.console import log_shown
+    from hat_ros.config import load_config
+    from hat_ros.errors import UsageError
+    from hat_ros.io.own_folder import checked_out
+
+    if len(arguments.recordings) != 1 or min(arguments.rates) < 1:
+        raise UsageError("--live takes one bag and rates of at least 1 Hz: hat bench --live BAG --out DIR")
+    out = checked_out(arguments.out).resolve()
+    config = load_config(arguments.config, arguments.overrides)
+    bench = LiveBench(Path(arguments.recordings[0]), config, arguments.graph, float(arguments.seconds))
+    with log_shown(Console(stderr=True)):
+        tables = {"live_rates": bench.rates([float(rate) for rate in arguments.rates])}
+        print(tables["live_rates"].text())
+        tables["live_faults"] = bench.faults(float(arguments.rates[0]))
+        print(tables["live_faults"].text())
+    out.mkdir(parents=True, exist_ok=True)
+    for name, table in tables.items():
+        table.write(out, name)
+    return 0
+
+
 def _bench(arguments: argparse.Namespace) -> int:
+    if arguments.live:
+        return _bench_live(arguments)
     from hat_ros.bench.evaluation.figures import image_bytes
     from hat_ros.bench.experiments import comparison
     from hat_ros.bench.experiments.comparison_figure import bench_figure

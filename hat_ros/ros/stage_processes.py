@@ -76,6 +76,12 @@ class StageProcesses:
             self._start(name, *self._started[name])
         return died
 
+    def end(self, name: str) -> None:
+        """End one process for good."""
+        process = self._processes.pop(name)
+        process.terminate()
+        process.wait()
+
     def pid(self, name: str) -> int:
         """Process id of a process that was started."""
         return self._processes[name].pid
