@@ -165,7 +165,8 @@ class LearnedSegmenter:
         inside = log_odds > 0
         if not inside.any() or evidence[inside].mean() <= 0.0:
             return None
-        return _sharpened(rgb, window.in_image(log_odds, (rgb.shape[1], rgb.shape[0])), 1.0 / window.scale)
+        mask = _sharpened(rgb, window.in_image(log_odds, (rgb.shape[1], rgb.shape[0])), 1.0 / window.scale)
+        return mask if mask.any() else None
 
     def _search(self, rgb: UInt8) -> Mask | None:
         """The target from nothing: regions of evidence in the whole image, each looked at again in its window."""

@@ -131,3 +131,10 @@ def test_equal_inputs_give_equal_bytes(lopsided, segmenter, scene):
     for i in range(3):
         rgb = scene.passing(i)[1]
         np.testing.assert_array_equal(found(segmenter, i, rgb), found(other, i, rgb))
+
+
+def test_a_mask_that_sharpening_removes_is_no_mask(segmenter, scene, monkeypatch):
+    """A speck before noise: the frame after it found an empty mask to move on from, and divided by its area."""
+    monkeypatch.setattr("hat_ros.segmentation.learned.refine_outline", lambda rgb, mask, band, contrast: 0 * mask)
+    for i in range(3):
+        assert segmenter.update(frame(i, scene.passing(i)[1]), None) is None
