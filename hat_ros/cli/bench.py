@@ -209,14 +209,11 @@ def _bench_live(arguments: argparse.Namespace) -> int:
     out = checked_out(arguments.out).resolve()
     config = load_config(arguments.config, arguments.overrides)
     bench = LiveBench(Path(arguments.recordings[0]), config, arguments.graph, float(arguments.seconds))
-    with log_shown(Console(stderr=True)):
-        tables = {"live_rates": bench.rates([float(rate) for rate in arguments.rates])}
-        print(tables["live_rates"].text())
-        tables["live_faults"] = bench.faults(float(arguments.rates[0]))
-        print(tables["live_faults"].text())
     out.mkdir(parents=True, exist_ok=True)
-    for name, table in tables.items():
-        table.write(out, name)
+    with log_shown(Console(stderr=True)):
+        for name, table in bench.tables([float(rate) for rate in arguments.rates]):
+            print(table.text())
+            table.write(out, name)
     return 0
 
 

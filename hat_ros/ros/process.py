@@ -96,7 +96,7 @@ def main(node_classes: Sequence[type[HatNode[Session]]], args: Sequence[str] | N
     finally:
         close(executor, nodes)
         context.try_shutdown()
-        # The interpreter would look at every object once more: half a second of processor time, and a node must go fast.
+        # The interpreter would look at every object once more: half a second of processor time at the end of a node.
         gc.freeze()
     if failure is not None:
         print(failure, file=sys.stderr)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -66,6 +67,11 @@ class LiveBench:
     config: HatConfig
     graph: str
     seconds: float
+
+    def tables(self, rates_hz: list[float]) -> Iterator[tuple[str, Table]]:
+        """Name and table, each as soon as it is measured; the faults at the first of the rates."""
+        yield "live_rates", self.rates(rates_hz)
+        yield "live_faults", self.faults(rates_hz[0])
 
     def rates(self, rates_hz: list[float]) -> Table:
         """A row for this process without a graph, and one for each rate of the camera."""
