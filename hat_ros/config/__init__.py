@@ -35,7 +35,7 @@ from hat_ros.config.loader import (
     preset_names,
 )
 from hat_ros.config.option import LEVELS, Level, describe
-from hat_ros.config.schema import CameraConfig, GraphConfig, HatConfig, NetsConfig
+from hat_ros.config.schema import CameraConfig, GraphConfig, HatConfig, InitialPoseConfig, NetsConfig
 from hat_ros.config.text import commented_yaml, differences, value_text
 
 __all__ = [
@@ -49,6 +49,7 @@ __all__ = [
     "GraphConfig",
     "HatConfig",
     "HypothesesConfig",
+    "InitialPoseConfig",
     "KeyframeConfig",
     "LearnedConfig",
     "Level",

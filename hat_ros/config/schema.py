@@ -72,6 +72,24 @@ class CameraConfig:
 
 
 @dataclass(frozen=True)
+class InitialPoseConfig:
+    """Where a navigation solution expects the target in the first frame of a recording."""
+
+    pose: str = option(
+        "",
+        "coarse pose of the target in the camera frame, 'x y z qx qy qz qw' (m, unit quaternion), that narrows the "
+        "search until the target is found; empty: search everywhere",
+        level="basic",
+    )
+    sigma: str = option(
+        "",
+        "its 1 sigma: 6 numbers, x y z (m) and rotation about the camera's x y z (rad), or the 36 of the covariance, "
+        "row by row; large = unknown (from 1.05 rad on nothing is known of a rotation)",
+        level="basic",
+    )
+
+
+@dataclass(frozen=True)
 class GraphConfig:
     """The ROS graph."""
 
@@ -119,6 +137,7 @@ class HatConfig:
     """The whole configuration; one attribute per section of the YAML file."""
 
     camera: CameraConfig = field(default_factory=CameraConfig)
+    initial_pose: InitialPoseConfig = field(default_factory=InitialPoseConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
     hypotheses: HypothesesConfig = field(default_factory=HypothesesConfig)

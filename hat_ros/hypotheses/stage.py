@@ -8,6 +8,7 @@ from hat_ros.array_types import Float
 from hat_ros.config import HatConfig
 from hat_ros.core.cadence import Cadence
 from hat_ros.core.guard import guard_candidates
+from hat_ros.core.initial_pose import Acquisition, InitialPose
 from hat_ros.core.keyframes import KeyframeSchedule
 from hat_ros.segmentation.annotated import pad_box
 from hat_ros.stages import PoseRefiner, create_backend
@@ -38,6 +39,7 @@ class HypothesisStage:
         self._apart_deg, self._min_lead = config.fusion.gate_angle_deg, config.refinement.min_margin
         self._backend = create_backend("hypotheses", config, target)
         self._symmetry = symmetry_of(target)
+        self._acquisition = Acquisition(config)
         self._R_reference: Float | None = None
         self._newest: Detection | None = None
         self._changed = False
@@ -48,6 +50,7 @@ class HypothesisStage:
         Raises:
             CandidateError: the backend returned a score or pose that is not finite and ``hypotheses.guard`` is off.
         """
+        initial = self._acquisition.at(prior)
         # A body of revolution turns under outlines and light that stay: its track is held against images alone often.
         healthy = prior is not None and prior.healthy and not len(self._symmetry.axes)
         self._observe(detection)
@@ -56,14 +59,25 @@ class HypothesisStage:
         if not self._schedule.update(detection is not None, healthy, failed, n_missed) or detection is None:
             return Candidates.none()
         self._changed = False
-        candidates = self._one_of_equals(self.generate(frame, detection, prior), prior)
+        candidates = self._one_of_equals(self.generate(frame, detection, prior, initial), prior)
+        if len(candidates):
+            self._acquisition.found()
         self._schedule.answered(decided=candidates.lead(self._apart_deg) >= self._min_lead)
         return candidates
 
-    def generate(self, frame: Frame, detection: Detection, prior: PosePrior | None) -> Candidates:
-        """Candidates of one image, whether it is a keyframe or not; arguments and errors as for :meth:`update`."""
-        candidates = self._backend.generate(frame, self._seen(detection), prior).first(self._max_candidates)
-        return guard_candidates(candidates, self._drop_implausible)
+    def generate(
+        self, frame: Frame, detection: Detection, prior: PosePrior | None, initial: InitialPose | None = None
+    ) -> Candidates:
+        """Candidates of one image, whether it is a keyframe or not; arguments and errors as for :meth:`update`.
+
+        Of a target that is sought with an initial pose, those alone that agree with it.
+        """
+        if initial is not None:
+            prior = initial.as_start(frame.stamp_ns)
+        candidates = self._backend.generate(frame, self._seen(detection), prior)
+        if initial is not None:
+            candidates = initial.keep(candidates.nearest(self._symmetry, initial.R_cam_target))
+        return guard_candidates(candidates.first(self._max_candidates), self._drop_implausible)
 
     @property
     def refiner(self) -> PoseRefiner | None:
@@ -75,6 +89,7 @@ class HypothesisStage:
         self._schedule.reset()
         self._cadence.reset()
         self._backend.reset()
+        self._acquisition.reset()
         self._newest, self._changed, self._R_reference = None, False, None
 
     def _one_of_equals(self, candidates: Candidates, prior: PosePrior | None) -> Candidates:

@@ -100,6 +100,8 @@ def declare_parameters(node: Node, extra: dict[str, tuple[Any, str]] | None = No
             raise ConfigError(f"node {node.get_name().removeprefix('hat_')}: unknown parameter '{name}': {advice}")
     run = {name: _checked(name, given.get(name, default), default) for name, (default, _) in run_options.items()}
     config = _configure(run["config"], {name: given[name] for name in given if name not in run_options})
+    if run["live"] and config.initial_pose.pose:
+        raise ConfigError("initial_pose.pose: it belongs to the first frame of a recording, not to a live graph")
     for name, (_, doc) in run_options.items():
         node.declare_parameter(name, run[name], ParameterDescriptor(description=doc, read_only=True), True)
     for name, (value, field) in flat_options(config).items():

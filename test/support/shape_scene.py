@@ -15,16 +15,21 @@ CAMERA = Camera(np.array([[500.0, 0, 159.5], [0, 500.0, 119.5], [0, 0, 1]]), 320
 
 
 def spacecraft(name="lopsided"):
-    """A box with one long panel, a dish and a boom, about 2.5 m across; parts of different grey."""
-    parts = [
+    """The target made of :func:`craft_parts`."""
+    parts = craft_parts()
+    for mesh, grey in parts:
+        mesh.visual.face_colors = np.tile([grey, grey, grey, 255], (len(mesh.faces), 1))
+    return target_from_scene(trimesh.Scene([mesh for mesh, _ in parts]), name)
+
+
+def craft_parts():
+    """Meshes and greys of a box with one long panel, a dish and a boom, about 2.5 m across."""
+    return [
         (trimesh.creation.box((0.8, 0.7, 0.9)), 200),
         (trimesh.creation.box((1.4, 0.04, 0.6), transform=lie.transform(np.eye(3), [1.1, 0, 0.1])), 90),
         (trimesh.creation.cone(0.35, 0.4, transform=lie.transform(np.eye(3), [-0.1, 0.1, 0.45])), 230),
         (trimesh.creation.cylinder(0.05, 0.9, transform=lie.transform(np.eye(3), [-0.3, -0.3, -0.8])), 150),
     ]
-    for mesh, grey in parts:
-        mesh.visual.face_colors = np.tile([grey, grey, grey, 255], (len(mesh.faces), 1))
-    return target_from_scene(trimesh.Scene([mesh for mesh, _ in parts]), name)
 
 
 def random_pose(rng, target, range_m=(6.0, 9.0), offset=0.06):
