@@ -34,6 +34,12 @@ ABOUT: dict[str, tuple[str, str, str, str]] = {
         "any",
         "mono8: 255 silhouette, 128 box; read only with `segmentation.backend: annotated`",
     ),
+    topics.INITIAL_POSE: (
+        INPUTS,
+        "navigation to segmentation, live",
+        "any",
+        "where the target is, roughly, with its covariance, see [Your own recording](tutorial.md)",
+    ),
     topics.TARGET_POSE: (
         OUTPUTS,
         "fusion to GNC",
@@ -61,6 +67,12 @@ ABOUT: dict[str, tuple[str, str, str, str]] = {
     topics.DIAGNOSTICS: (OUTPUTS, "all nodes", "1 Hz and on change", "health of each node, with figures"),
     topics.HAT_CAMERA_INFO: (STAGES, "segmentation to all", "once, latched", "the calibration in use"),
     topics.ADMISSION: (STAGES, "segmentation to all", "one row per frame", "number and epoch of an admitted frame"),
+    topics.GIVEN_POSE: (
+        STAGES,
+        "segmentation to hypotheses",
+        "when one was given",
+        "the initial pose that is in force from the frame of its stamp on",
+    ),
     topics.FRAME: (
         STAGES,
         "segmentation to hypotheses, slam, fusion",
@@ -97,6 +109,7 @@ QOS: dict[str, str] = {
     **dict.fromkeys((topics.HYPOTHESES, topics.SLAM_ODOMETRY, topics.ANCHOR), "reliable, depth 10"),
     **dict.fromkeys((topics.TARGET_POSE, topics.TARGET_POSE_WITH_COVARIANCE), "reliable, depth 10"),
     topics.DIAGNOSTICS: "reliable, depth 10",
+    topics.INITIAL_POSE: "reliable, depth 10",
     topics.TF: "reliable, depth 100",
     topics.OVERLAY: "best effort, depth 1",
 }
@@ -128,7 +141,7 @@ def topic_tables() -> str:
 
 def qos_text(topic: str) -> str:
     """Quality of service of a topic in words; inputs differ between a camera and a replay."""
-    if ABOUT[topic][0] == INPUTS:
+    if ABOUT[topic][0] == INPUTS and topic not in QOS:
         return f"live: {LIVE_INPUT_QOS};<br>replay: {STAGE_QOS}"
     return QOS.get(topic, STAGE_QOS)
 

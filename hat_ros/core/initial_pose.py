@@ -91,7 +91,6 @@ class InitialPose:
                 )
         if row[2] + SIGMAS * math.sqrt(covariance[2, 2]) <= 0.0:
             raise InputError(f"initial pose: the target is behind the camera, z = {row[2]:g} m and its sigma is small")
-        row = np.concatenate([row[:3], row[3:] / np.linalg.norm(row[3:])])
         object.__setattr__(self, "pose_row", row)
         object.__setattr__(self, "covariance", covariance)
 
@@ -212,9 +211,14 @@ class Acquisition:
         self._fed_back = config.prior.enabled
         self._begun = False
 
-    def at(self, prior: PosePrior | None) -> InitialPose | None:
-        """What is in force at a frame with this prior, None for none; to be called once for each frame."""
+    def at(self, prior: PosePrior | None, given: InitialPose | None = None) -> InitialPose | None:
+        """What is in force at a frame with this prior, None for none; to be called once for each frame.
+
+        What is ``given`` with the frame takes the place of what came before.
+        """
         self._begun = True
+        if given is not None:
+            self._pose = given
         if prior is not None:
             self._pose = None
         return self._pose

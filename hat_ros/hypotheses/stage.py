@@ -44,13 +44,17 @@ class HypothesisStage:
         self._newest: Detection | None = None
         self._changed = False
 
-    def update(self, frame: Frame, detection: Detection | None, prior: PosePrior | None) -> Candidates:
+    def update(
+        self, frame: Frame, detection: Detection | None, prior: PosePrior | None, given: InitialPose | None = None
+    ) -> Candidates:
         """Candidates of one frame, best first; zero rows between keyframes and without a detection.
+
+        What navigation says of the target is ``given`` with the frame from which on it is in force.
 
         Raises:
             CandidateError: the backend returned a score or pose that is not finite and ``hypotheses.guard`` is off.
         """
-        initial = self._acquisition.at(prior)
+        initial = self._acquisition.at(prior, given)
         # A body of revolution turns under outlines and light that stay: its track is held against images alone often.
         healthy = prior is not None and prior.healthy and not len(self._symmetry.axes)
         self._observe(detection)

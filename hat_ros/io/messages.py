@@ -14,7 +14,7 @@ from typing import Any
 
 from hat_ros.io.image_messages import ImageWire, camera_from, frame_from
 from hat_ros.io.message_family import message_class, stamp_of
-from hat_ros.io.pose_messages import PoseWire, pose_row_from
+from hat_ros.io.pose_messages import PoseWire, initial_pose_from, pose_row_from
 from hat_ros.io.stage_tables import (
     Admitted,
     StageWire,
@@ -37,6 +37,7 @@ __all__ = [
     "camera_from",
     "candidates_from",
     "frame_from",
+    "initial_pose_from",
     "message_class",
     "motion_from",
     "pose_row_from",

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from hat_ros.array_types import Float
+from hat_ros.core.initial_pose import InitialPose
 from hat_ros.io.message_family import MessageFamily
 from hat_ros.types import Motion
 
@@ -84,3 +85,13 @@ def pose_row_from(pose: Any) -> Float:
     """(7,) row of a geometry_msgs/Pose, as it stands."""
     p, q = pose.position, pose.orientation
     return np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w], dtype=np.float64)
+
+
+def initial_pose_from(message: Any) -> InitialPose:
+    """Decode a PoseWithCovarianceStamped that says roughly where the target is.
+
+    Raises:
+        InputError: it is no possible pose.
+    """
+    covariance = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
+    return InitialPose(pose_row_from(message.pose.pose), covariance)

@@ -28,12 +28,14 @@ class Admitted:
         epoch: counts resets of the graph; a new one tells every stage to start afresh at this frame.
         resumed: 1 if this epoch goes on with a target that was confirmed in the one before: a stage was lost, not the
             target.
+        initial_pose: 1 if an initial pose comes into force here; ``/hat/initial_pose`` has it, with the same stamp.
     """
 
     seq: int
     dropped_total: int
     epoch: int
     resumed: int = 0
+    initial_pose: int = 0
 
 
 @dataclass(frozen=True)

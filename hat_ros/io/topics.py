@@ -10,9 +10,11 @@ IMAGE_COMPRESSED = "/image/compressed"
 CAMERA_INFO = "/camera_info"
 DETECTION_MASK = "/detection/mask"
 GROUND_TRUTH = "/ground_truth/target_pose"
+INITIAL_POSE = "/initialpose"
 
 HAT_CAMERA_INFO = "/hat/camera_info"
 ADMISSION = "/hat/admission"
+GIVEN_POSE = "/hat/initial_pose"
 FRAME = "/hat/frame"
 HYPOTHESES_SCORED = "/hat/hypotheses_scored"
 HYPOTHESES = "/hat/hypotheses"
@@ -37,8 +39,10 @@ TYPES: dict[str, str] = {
     IMAGE_COMPRESSED: "sensor_msgs/msg/CompressedImage",
     CAMERA_INFO: "sensor_msgs/msg/CameraInfo",
     DETECTION_MASK: "sensor_msgs/msg/Image",
+    INITIAL_POSE: "geometry_msgs/msg/PoseWithCovarianceStamped",
     HAT_CAMERA_INFO: "sensor_msgs/msg/CameraInfo",
     ADMISSION: "sensor_msgs/msg/PointCloud2",
+    GIVEN_POSE: "geometry_msgs/msg/PoseWithCovarianceStamped",
     FRAME: "sensor_msgs/msg/Image",
     HYPOTHESES_SCORED: "sensor_msgs/msg/PointCloud2",
     HYPOTHESES: "geometry_msgs/msg/PoseArray",
@@ -71,6 +75,7 @@ def relative(topic: str) -> str:
 RECORDED = (
     HAT_CAMERA_INFO,
     ADMISSION,
+    GIVEN_POSE,
     HYPOTHESES_SCORED,
     HYPOTHESES,
     SLAM_STATE,
@@ -116,4 +121,4 @@ STATUS_COLUMNS = (
 )
 # Those of the first release: columns are added at the end only, and readers accept fewer and more from here on.
 N_STATUS_AT_FIRST = 17
-ADMISSION_COLUMNS = ("seq", "dropped_total", "epoch", "resumed")
+ADMISSION_COLUMNS = ("seq", "dropped_total", "epoch", "resumed", "initial_pose")

@@ -18,7 +18,7 @@ class HypothesesSession(StageSession):
 
     def __init__(self, node: HatNode[Session]) -> None:
         self._stage = HypothesisStage(node.settings.config, node.settings.load_target())
-        super().__init__(node, self._stage, (topics.FRAME,), uses_prior=True)
+        super().__init__(node, self._stage, (topics.FRAME,), uses_prior=True, takes_given=True)
         self._wire = node.wire
         self._scored = node.endpoints.output(topics.HYPOTHESES_SCORED, "selector")
         self._shown = node.endpoints.output(topics.HYPOTHESES)
@@ -26,7 +26,7 @@ class HypothesesSession(StageSession):
     def step(self, joined: JoinedFrame) -> None:
         """Candidates of one frame."""
         frame, detection = joined.image()
-        candidates = self._stage.update(frame, detection, joined.prior)
+        candidates = self._stage.update(frame, detection, joined.prior, joined.given)
         self._scored.publish(self._wire.candidates(joined.stamp_ns, joined.frame_id, candidates))
         if len(candidates):
             self._shown.publish(self._wire.pose_array(joined.stamp_ns, joined.frame_id, candidates.pose_rows))

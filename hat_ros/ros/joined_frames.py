@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from hat_ros.config import PriorConfig
+from hat_ros.core.initial_pose import InitialPose
 from hat_ros.core.sync import ExactJoin
 from hat_ros.errors import RunError
 from hat_ros.io import messages, topics
@@ -27,6 +28,7 @@ class JoinedFrame:
         items: the joined messages by topic.
         camera: the calibration in force, None for a stage that gets no image.
         prior: what the fused past tells about the frame, None without one.
+        given: the initial pose that is in force from this frame on, None without one.
     """
 
     stamp_ns: int
@@ -34,6 +36,7 @@ class JoinedFrame:
     items: dict[str, Any]
     camera: Camera | None
     prior: PosePrior | None
+    given: InitialPose | None = None
 
     @property
     def frame_id(self) -> str:
@@ -61,18 +64,26 @@ class JoinedFrames:
         reset: called when a frame opens a new epoch: forget the target's state.
         live: a frame of which a message was lost is passed over, and its estimate is not waited for. The entrance lets
             the next one in only when it has given that frame up.
+        takes_given: initial poses are waited for and handed out.
 
     Attributes:
         lost: frames that were passed over.
     """
 
     def __init__(
-        self, joined: Sequence[str], prior: PriorConfig | None, reset: Callable[[], None], live: bool = False
+        self,
+        joined: Sequence[str],
+        prior: PriorConfig | None,
+        reset: Callable[[], None],
+        live: bool = False,
+        takes_given: bool = False,
     ) -> None:
         self._join = ExactJoin((topics.ADMISSION, *joined))
         self._priors = None if prior is None else PriorBuffer(prior)
         self._reset = reset
         self._with_image = topics.FRAME in joined
+        self._given: dict[int, InitialPose] = {}
+        self._takes_given = takes_given
         self._cameras: list[tuple[int, Camera]] = []
         self._epoch: int | None = None  # of the last frame taken; None: the next one opens an epoch
         self._is_fresh = True
@@ -113,6 +124,10 @@ class JoinedFrames:
         self._cameras = [item for item in self._cameras if item[0] < stamp_ns]
         self._cameras.append((stamp_ns, messages.camera_from(message)))
 
+    def put_given(self, message: Any) -> None:
+        """Add an initial pose, in force from the frame of its stamp on."""
+        self._given[messages.stamp_of(message)] = messages.initial_pose_from(message)
+
     def put_status(self, message: Any) -> None:
         """Add a fused pose of the past."""
         if self._priors is not None:
@@ -138,13 +153,19 @@ class JoinedFrames:
             if not self._live and not self._priors.ready(stamp_ns):
                 return None
         camera = self._camera_at(stamp_ns)
-        if camera is None and self._with_image:
+        if (camera is None and self._with_image) or self._awaits_given(stamp_ns, admitted):
             return None
         if self._live:
             self._pass_over(stamp_ns)
         self._join.take()
         prior = None if self._priors is None else self._priors.before(stamp_ns)
-        return JoinedFrame(stamp_ns, admitted, items, camera, prior)
+        return JoinedFrame(stamp_ns, admitted, items, camera, prior, self._given.pop(stamp_ns, None))
+
+    def _awaits_given(self, stamp_ns: int, admitted: messages.Admitted) -> bool:
+        """Whether a frame's initial pose is still to come; a frame that is not the newest, live, was given up."""
+        if not (self._takes_given and admitted.initial_pose) or stamp_ns in self._given:
+            return False
+        return not (self._live and stamp_ns < self._newest_ns)
 
     def _pass_over(self, stamp_ns: int) -> None:
         """Frames before this one that are not complete, or were never answered, have been given up."""

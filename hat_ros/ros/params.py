@@ -17,6 +17,7 @@ from rclpy.node import Node
 
 from hat_ros.config import HatConfig, config_from_dict, config_to_dict, describe, flat_options, load_config
 from hat_ros.errors import ConfigError
+from hat_ros.io import topics
 
 if TYPE_CHECKING:
     from hat_ros.target.model import Target
@@ -101,7 +102,10 @@ def declare_parameters(node: Node, extra: dict[str, tuple[Any, str]] | None = No
     run = {name: _checked(name, given.get(name, default), default) for name, (default, _) in run_options.items()}
     config = _configure(run["config"], {name: given[name] for name in given if name not in run_options})
     if run["live"] and config.initial_pose.pose:
-        raise ConfigError("initial_pose.pose: it belongs to the first frame of a recording, not to a live graph")
+        where = topics.relative(topics.INITIAL_POSE)
+        raise ConfigError(
+            f"initial_pose.pose: it belongs to the first frame of a recording; live, send the pose on the topic {where}"
+        )
     for name, (_, doc) in run_options.items():
         node.declare_parameter(name, run[name], ParameterDescriptor(description=doc, read_only=True), True)
     for name, (value, field) in flat_options(config).items():

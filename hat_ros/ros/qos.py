@@ -26,6 +26,8 @@ RECORDER = _profile(_RELIABLE, 256, _VOLATILE)
 RECORDER_LATCH = _profile(_RELIABLE, 256, DurabilityPolicy.TRANSIENT_LOCAL)
 
 _OF = {
+    topics.INITIAL_POSE: OUT,
+    topics.GIVEN_POSE: STAGE,
     **dict.fromkeys((topics.HAT_CAMERA_INFO, topics.ALIGNMENT, topics.ALIGNMENT_TRANSFORM), LATCH),
     **dict.fromkeys((topics.READY, topics.END_OF_STREAM), LATCH),
     **dict.fromkeys((topics.ADMISSION, topics.FRAME, topics.HYPOTHESES_SCORED, topics.SLAM_STATE), STAGE),

@@ -9,8 +9,9 @@ from typing import Any
 from rclpy.duration import Duration
 from std_srvs.srv import Trigger
 
+from hat_ros.core.initial_pose import InitialPose
 from hat_ros.core.sync import RESTART_FRAMES
-from hat_ros.errors import FrameError, RunError
+from hat_ros.errors import FrameError, InputError, RunError
 from hat_ros.io import messages, topics
 from hat_ros.io.calibration import calibration_from
 from hat_ros.ros import qos
@@ -52,6 +53,7 @@ class SegmentationSession(Session):
         self._epoch = 0
         self._last_state, self._resumed = TrackState.UNINITIALISED, False
         self._camera_sent = self._is_open = False
+        self._given: tuple[InitialPose, str] | None = None  # a pose that waits for the next frame, and its frame_id
         self._ready_nodes: set[str] = set()
         self._delay = ExtraDelay(node.NAME, config.graph.debug_stage_delay_ms)
         self._step_timer = StepTimer()
@@ -61,6 +63,7 @@ class SegmentationSession(Session):
         self._camera_info = node.endpoints.output(topics.HAT_CAMERA_INFO, "hypotheses", "slam", *readers)
         self._admission = node.endpoints.output(topics.ADMISSION, *sorted(_STAGES))
         self._frame = node.endpoints.output(topics.FRAME, "hypotheses", "slam", *readers)
+        self._given_pose = node.endpoints.output(topics.GIVEN_POSE, "hypotheses")
         self._service = node.create_service(Trigger, topics.relative(topics.RESET), self._on_reset)
         self._timer = node.create_timer(0.1, partial(node.guarded, self._check_time), clock=STEADY)
 
@@ -71,6 +74,8 @@ class SegmentationSession(Session):
         infos = CameraInput(node, endpoints, (topics.CAMERA_INFO,), live, self._on_camera_info)
         if annotated:
             subscribe(topics.DETECTION_MASK, self._on_mask, profile=qos.IN_REPLAY, required=not live)
+        if live:
+            subscribe(topics.INITIAL_POSE, self._on_initial_pose, required=False)
         subscribe(topics.STATUS, self._on_status)
         subscribe(topics.READY, self._on_ready, profile=qos.LATCH_READER, required=False)
         return images, infos
@@ -159,6 +164,27 @@ class SegmentationSession(Session):
             self._new_epoch()
         self._pump()
 
+    def _on_initial_pose(self, message: Any) -> None:
+        try:
+            self._given = messages.initial_pose_from(message), message.header.frame_id
+        except InputError as error:
+            self._warn(f"{topics.INITIAL_POSE} refused: {error}")
+
+    def _take_initial_pose(self, stamp_ns: int, frame_id: str) -> InitialPose | None:
+        """What has been given since the last frame; hypotheses and the record get it with this frame's stamp."""
+        given, self._given = self._given, None
+        if given is None:
+            return None
+        pose, its_frame_id = given
+        if its_frame_id not in ("", frame_id):
+            self._warn(
+                f"{topics.INITIAL_POSE} refused: it is in frame '{its_frame_id}', the images are in '{frame_id}'"
+            )
+            return None
+        message = self._wire.pose_with_covariance(stamp_ns, frame_id, pose.pose_row, pose.covariance)
+        self._given_pose.publish(message)
+        return pose
+
     def _on_status(self, message: Any) -> None:
         estimate = messages.status_from(message).estimate
         self._priors.push(estimate)
@@ -222,11 +248,14 @@ class SegmentationSession(Session):
             limit_s = self._config.live_timeout_s if self._node.settings.live else 5.0
             self._camera_info.wait_for_all_acked(Duration(seconds=limit_s))
         seq = self._in_flight.enter(stamp_ns)
-        admitted = messages.Admitted(seq, self._entrance.dropped_total, self._epoch, int(self._resumed))
+        given = self._take_initial_pose(stamp_ns, frame_id)
+        admitted = messages.Admitted(
+            seq, self._entrance.dropped_total, self._epoch, int(self._resumed), int(given is not None)
+        )
         self._admission.publish(self._wire.admission(stamp_ns, frame_id, admitted))
         self._delay.wait()
         with self._step_timer.frame():
-            detection = self._stage.update(frame, self._priors.before(stamp_ns))
+            detection = self._stage.update(frame, self._priors.before(stamp_ns), given)
             self._frame.publish(self._wire.frame(stamp_ns, frame_id, frame.rgb, detection))
 
     def _begin_anew(self, stamp_ns: int) -> None:

@@ -31,14 +31,21 @@ class StageSession(Session, ABC):
         stage: the stage object; it is reset when a new epoch begins.
         joined: topics of which the stage needs one message per frame, beside the admission.
         uses_prior: the stage takes fused poses of the past, if the configuration enables them.
+        takes_given: the stage takes initial poses.
     """
 
     def __init__(
-        self, node: HatNode[Session], stage: Resettable, joined: Sequence[str], uses_prior: bool = False
+        self,
+        node: HatNode[Session],
+        stage: Resettable,
+        joined: Sequence[str],
+        uses_prior: bool = False,
+        takes_given: bool = False,
     ) -> None:
         config = node.settings.config
         self._diagnostics = node.diagnostics
-        self._frames = JoinedFrames(joined, config.prior if uses_prior else None, stage.reset, node.settings.live)
+        prior = config.prior if uses_prior else None
+        self._frames = JoinedFrames(joined, prior, stage.reset, node.settings.live, takes_given)
         self._delay = ExtraDelay(node.NAME, config.graph.debug_stage_delay_ms)
         self._step_timer = StepTimer()
         self._answered = 0
@@ -48,6 +55,9 @@ class StageSession(Session, ABC):
             node.endpoints.input(topic, partial(self._receive, partial(self._frames.put, topic)))
         if uses_prior and config.prior.enabled:
             node.endpoints.input(topics.STATUS, partial(self._receive, self._frames.put_status))
+        if takes_given:
+            put = partial(self._receive, self._frames.put_given)
+            node.endpoints.input(topics.GIVEN_POSE, put, required=False)
 
     @abstractmethod
     def step(self, joined: JoinedFrame) -> None:

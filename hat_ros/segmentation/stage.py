@@ -7,7 +7,7 @@ import numpy as np
 
 from hat_ros.array_types import Bool, UInt8
 from hat_ros.config import HatConfig
-from hat_ros.core.initial_pose import Acquisition
+from hat_ros.core.initial_pose import Acquisition, InitialPose
 from hat_ros.errors import FrameError
 from hat_ros.stages import create_backend
 from hat_ros.target.model import Target
@@ -37,12 +37,13 @@ class SegmentationStage:
         self._reach_m = float(np.linalg.norm(target.vertices_m, axis=1).max())
         self._window: Window | None = None  # part of the image that the backend was shown last, None = all of it
 
-    def update(self, frame: Frame, prior: PosePrior | None) -> Detection | None:
+    def update(self, frame: Frame, prior: PosePrior | None, given: InitialPose | None = None) -> Detection | None:
         """Segment one frame.
 
         Args:
             frame: the admitted frame.
             prior: prediction from fused poses of the past, or None.
+            given: what navigation says of the target, in force from this frame on.
 
         Returns:
             The detection, or None when the frame is black or the mask is too small or covers the whole image, or is not
@@ -51,7 +52,7 @@ class SegmentationStage:
         Raises:
             FrameError: the backend's mask does not have the image's size.
         """
-        initial = self._acquisition.at(prior)
+        initial = self._acquisition.at(prior, given)
         if is_black(frame.rgb):
             return None
         region = None if initial is None else initial.region(frame.camera, self._reach_m)

@@ -164,3 +164,33 @@ def test_a_stage_without_images_has_none():
     frames.put(topics.SLAM_STATE, WIRE.motion(1, "cam", Motion.none()))
     with pytest.raises(RunError, match="not joined"):
         frames.take().image()
+
+
+def given(stamp):
+    row = np.array([0.1, 0.2, 5.0, 0, 0, 0, 1])
+    return WIRE.pose_with_covariance(stamp, "cam", row, np.eye(6) * stamp)
+
+
+@pytest.mark.parametrize("live", [False, True])
+def test_a_frame_waits_for_the_initial_pose_that_its_admission_promises(live):
+    frames = JoinedFrames((), None, lambda: None, live, takes_given=True)
+    for stamp, promised in ((1, 0), (2, 1), (3, 0)):
+        if stamp == 3 and not live:
+            frames.put_given(given(2))
+        frames.put(topics.ADMISSION, WIRE.admission(stamp, "cam", messages.Admitted(stamp, 0, 0, 0, promised)))
+    joined = [frames.take() for _ in range(4)]
+    found = [(frame.stamp_ns, frame.given) for frame in joined if frame is not None]
+    if live:  # lost for a frame that has been given up: the next one does not wait for it
+        assert found == [(1, None), (2, None), (3, None)]
+        return
+    assert [stamp for stamp, _ in found] == [1, 2, 3]
+    assert [pose is not None for _, pose in found] == [False, True, False]
+    assert np.array_equal(found[1][1].covariance, 2 * np.eye(6))
+
+
+def test_nothing_is_handed_out_before_the_initial_pose_has_come():
+    frames = JoinedFrames((), None, lambda: None, True, takes_given=True)
+    frames.put(topics.ADMISSION, WIRE.admission(1, "cam", messages.Admitted(1, 0, 0, 0, 1)))
+    assert frames.take() is None
+    frames.put_given(given(1))
+    assert frames.take().given is not None
