@@ -1,7 +1,8 @@
-"""A live graph told on a topic where the target is."""
+"""A graph told where the target is: live on a topic, in a replay by its configuration."""
 
 import numpy as np
 import pytest
+from graph_clip import run_in_process, said
 from live_nodes import WIRE, LiveNodes
 from single_node import spin_until
 from two_craft import as_text, craft_at, write_two_craft
@@ -11,6 +12,7 @@ from hat_ros.core.initial_pose import InitialPose
 from hat_ros.geometry import lie
 from hat_ros.io import messages, topics
 from hat_ros.ros import qos
+from hat_ros.ros.graph import replay
 from hat_ros.target.loading import load_target
 from hat_ros.tracker import HatTracker
 from hat_ros.types import Frame
@@ -68,3 +70,17 @@ def test_live_the_craft_that_navigation_means_is_tracked_with_the_bytes_of_one_p
     assert "it is in frame 'elsewhere', the images are in 'cam'" in refused[-1]
     assert [node.failure for node in graph.nodes.values()] == [None] * 5
     graph.close()
+
+
+@pytest.mark.graph
+def test_a_replay_goes_by_the_initial_pose_of_the_configuration(tmp_path):
+    bag = write_two_craft(tmp_path / "bag", N_FRAMES)
+    config = load_config("default", OVERRIDES)
+    expected = run_in_process(bag, config, tmp_path / "one")
+    replay(bag, config, bag / "target.yaml", tmp_path / "graph", graph="single")
+    found = said(tmp_path / "graph")
+    assert len(expected[topics.TARGET_POSE]) == N_FRAMES
+    for topic, payload in expected.items():
+        assert found[topic] == payload, topic
+    positions = np.array([np.frombuffer(payload)[:3] for _, _, payload in found[topics.TARGET_POSE]])
+    assert np.linalg.norm(positions - craft_at(1, 0)[:3, 3], axis=1).max() < 0.2

@@ -84,3 +84,10 @@ def test_parameters_cannot_change_under_a_running_stage(make):
     node = make()
     (result,) = node.set_parameters([Parameter("selector.score_scale", value=1.0)])
     assert not result.successful
+
+
+def test_a_live_node_wants_the_initial_pose_on_its_topic(make):
+    given = {"initial_pose.pose": "0 0 5 0 0 0 1", "initial_pose.sigma": "1 1 1 1 1 1"}
+    assert make(**given).settings.config.initial_pose.pose == "0 0 5 0 0 0 1"
+    with pytest.raises(ConfigError, match="live, send the pose on the topic initialpose"):
+        make(live=True, **given)
