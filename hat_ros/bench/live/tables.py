@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from hat_ros.bench.evaluation.tables import Column, Table
-from hat_ros.bench.live.graph import LiveGraph, live_graph
-from hat_ros.bench.live.watch import Moment
 from hat_ros.config import HatConfig
 from hat_ros.errors import InputError, RunError
 from hat_ros.io.bag_reader import BagReader
+from hat_ros.ros.live_graph import LiveGraph, live_graph
+from hat_ros.ros.live_watch import Moment
 from hat_ros.ros.stage_processes import STAGES
 from hat_ros.target.loading import load_target
 from hat_ros.tracker import HatTracker

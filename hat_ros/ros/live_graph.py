@@ -19,7 +19,6 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from hat_ros.bench.live.watch import Moment, Watched
 from hat_ros.config import HatConfig, config_to_dict
 from hat_ros.errors import RunError
 from hat_ros.io import messages, topics
@@ -27,6 +26,7 @@ from hat_ros.io.messages import message_class
 from hat_ros.ros import qos
 from hat_ros.ros.domain import reserved_domain
 from hat_ros.ros.environment import replay_environment
+from hat_ros.ros.live_watch import Moment, Watched
 from hat_ros.ros.stage_processes import STAGES, StageProcesses
 
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")

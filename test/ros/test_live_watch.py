@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hat_ros.bench.live.watch import Moment, Watched
+from hat_ros.ros.live_watch import Moment, Watched
 
 
 @pytest.fixture
