@@ -66,9 +66,13 @@ class FusionSession(StageSession):
 
     def _log_change(self, estimate: Estimate) -> None:
         before = TrackState.UNINITIALISED if self._estimate is None else self._estimate.state
-        if estimate.state != before:
-            log = self._log.warning if estimate.state == TrackState.LOST else self._log.info
-            log(f"{before.name.lower()} -> {estimate.state.name.lower()}: {estimate.reason.words}")
+        if estimate.state == before:
+            return
+        sentence = f"{before.name.lower()} -> {estimate.state.name.lower()}: {estimate.reason.words}"
+        if estimate.state == TrackState.LOST:
+            self._log.warning(sentence)
+        else:
+            self._log.info(sentence)
 
     def every_second(self) -> None:
         """Measure the rate of poses."""

@@ -116,13 +116,15 @@ class SegmentationSession(Session):
         if silence is not None:
             self._diagnostics.report(silence[0], f"{silence[1]} on {self._images.describe()}")
         if self._watch.is_silent != was_silent:
-            log = self._node.get_logger()
-            (log.info if was_silent else log.warning)(
-                f"{self._images.describe()}: {'back' if was_silent else 'silent'}"
-            )
+            if was_silent:
+                self._node.get_logger().info(f"{self._images.describe()}: back")
+            else:
+                self._node.get_logger().warning(f"{self._images.describe()}: silent")
         overload = self._watch.overload(self._entrance.dropped_total)
-        if overload is not None:
-            (self._warn if self._watch.is_overloaded else self._node.get_logger().info)(overload)
+        if overload is not None and self._watch.is_overloaded:
+            self._warn(overload)
+        elif overload is not None:
+            self._node.get_logger().info(overload)
 
     def close(self) -> None:
         """Drop the service and the timer."""

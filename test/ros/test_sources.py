@@ -36,3 +36,13 @@ def test_no_node_ever_names_the_truth():
 def test_nodes_are_thin():
     for path in sorted((PACKAGE / "ros").glob("*_node.py")):
         assert len(path.read_text(encoding="utf-8").splitlines()) < 100, path
+
+
+def test_no_call_logs_with_two_severities():
+    """rclpy ties a severity to the place of a call: the second one raises ValueError there, minutes later."""
+    levels = {"debug", "info", "warning", "error", "fatal"}
+    for path, tree in sources():
+        for item in ast.walk(tree):
+            if isinstance(item, ast.IfExp):
+                chosen = {part.attr for part in (item.body, item.orelse) if isinstance(part, ast.Attribute)}
+                assert not chosen & levels, f"{path}:{item.lineno}"
