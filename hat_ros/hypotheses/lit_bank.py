@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from hat_ros.array_types import Float, Float32
 from hat_ros.cache import cached_arrays
-from hat_ros.geometry.masks import image_moments
 from hat_ros.refinement.sunlight import brightness
 from hat_ros.refinement.view import Surfels, TargetViewer
 from hat_ros.target.contour import COL_NU, COL_NV, COL_U, COL_V, COL_WEIGHT, contour_table
+from hat_ros.target.masks import image_moments
 from hat_ros.target.polar import MAX_RADIUS, N_RINGS, polar_grid
 from hat_ros.target.rays import pixel_rays
 from hat_ros.target.sphere import look_inwards

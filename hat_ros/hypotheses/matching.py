@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from hat_ros.array_types import Bool, Float, Float32
 from hat_ros.geometry import lie
-from hat_ros.geometry.masks import Moments, image_moments, mask_moments
 from hat_ros.hypotheses.lit_bank import subdued
+from hat_ros.target.masks import Moments, image_moments, mask_moments
 from hat_ros.target.polar import MAX_RADIUS, N_RINGS, PolarSampler, border_grid, polar_grid, ring_weights
 from hat_ros.target.view_bank import ViewBank
 from hat_ros.types import Camera

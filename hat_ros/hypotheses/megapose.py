@@ -19,11 +19,12 @@ from torch import Tensor
 from hat_ros.array_types import Float, UInt8
 from hat_ros.cache import cached_arrays
 from hat_ros.config import HatConfig, NetsConfig
-from hat_ros.geometry import lie, masks
+from hat_ros.geometry import lie
 from hat_ros.nets import megapose as mp
 from hat_ros.nets.checkpoint import load_into, load_state
 from hat_ros.nets.runtime import Runtime
 from hat_ros.nets.so3_grid import so3_grid
+from hat_ros.target import masks
 from hat_ros.target.model import Target
 from hat_ros.target.network_views import NetworkViewRenderer
 from hat_ros.target.rendering import Renderer, create_renderer

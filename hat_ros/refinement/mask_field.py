@@ -11,8 +11,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from hat_ros.array_types import Bool, Float, Float32, UInt8
-from hat_ros.geometry.masks import mask_moments
 from hat_ros.refinement.view import View
+from hat_ros.target.masks import mask_moments
 
 # Luma from which a pixel is certainly not a shadowed part of the target, which is black.
 VISIBLE_LEVEL = 32.0

@@ -1,7 +1,7 @@
 """The subscriptions of a camera: to one of the topics that it may use, with the reliability that it offers.
 
 Both are looked up from what is published. A subscription made before its camera would have to guess: a reliable one
-never hears a best-effort camera, and one to every transport makes a driver compress images that nobody needs.
+never hears a best-effort camera, and one to every transport makes a driver compress images without a reader.
 """
 
 from __future__ import annotations

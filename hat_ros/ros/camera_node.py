@@ -1,7 +1,7 @@
 """A camera for the test bench: plays a bag as a live camera would, at any rate, with any QoS, and with its faults.
 
-It waits for nobody and hears nothing: what the graph cannot keep up with is the graph's loss. ``hat bench --live`` and
-the scenarios of the tests use it; by hand it stands for a camera that is not there::
+It does not wait for the graph and subscribes to nothing: what the graph cannot keep up with is the graph's loss.
+``hat bench --live`` and the scenarios of the tests use it; by hand it stands for a camera that is not there::
 
     ros2 run hat_ros camera_node --ros-args -p bag:=bags/demo -p rate_hz:=30.0
 """

@@ -76,7 +76,7 @@ def prepare_environment() -> None:
 
 @contextlib.contextmanager
 def replay_environment() -> Iterator[None]:
-    """For a graph that concerns nobody else: our profile, and discovery on this machine only, unless the user set them.
+    """For a graph of this process alone: our profile, and discovery on this machine only, unless the user set them.
 
     What the process does afterwards, and what it starts then, finds the environment as it was.
     """

@@ -1,4 +1,4 @@
-"""Shared memory that killed processes have left behind: tens of MiB each, and nobody else frees it.
+"""Shared memory that killed processes have left behind: tens of MiB each, which the middleware does not free.
 
 A Fast DDS participant holds a lock on ``NAME_el`` as long as it lives, beside its segment ``NAME``. So a lock that can
 be taken belongs to a dead one; ``fastdds shm clean`` judges by the same sign.

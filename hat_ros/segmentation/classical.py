@@ -14,13 +14,13 @@ from __future__ import annotations
 import numpy as np
 
 from hat_ros.config import HatConfig
-from hat_ros.geometry.masks import overlap
 from hat_ros.segmentation.glow import look_into_space
 from hat_ros.segmentation.lit import LitBody
 from hat_ros.segmentation.masks import Mask, enlarge
 from hat_ros.segmentation.no_data import with_sky_in_borders
 from hat_ros.segmentation.shape import SilhouetteBank
 from hat_ros.segmentation.textured import TexturedBackground
+from hat_ros.target.masks import overlap
 from hat_ros.target.model import Target
 from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.types import Detection, Frame, PosePrior

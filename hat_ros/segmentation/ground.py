@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 
 from hat_ros.array_types import Float, UInt8
-from hat_ros.geometry.masks import overlap
 from hat_ros.segmentation.masks import Mask, Window
+from hat_ros.target.masks import overlap
 
 _SIDE_PX = 320  # longer side of the frames remembered
 _MAX_POINTS = 80

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from hat_ros.array_types import UInt8
-from hat_ros.geometry.masks import mask_moments
+from hat_ros.target.masks import mask_moments
 
 Mask = UInt8
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from hat_ros.array_types import UInt8
 from hat_ros.config import ClassicalConfig
-from hat_ros.geometry.masks import overlap
 from hat_ros.segmentation import region
 from hat_ros.segmentation.boundary import refine_outline
 from hat_ros.segmentation.ground import CLEAR, GroundMemory
@@ -19,6 +18,7 @@ from hat_ros.segmentation.masks import Mask, Window, shrink, touched_sides, touc
 from hat_ros.segmentation.motion import MotionDetector, MotionEvidence
 from hat_ros.segmentation.outlines import SharpOutlines, is_grey
 from hat_ros.segmentation.shape import SilhouetteBank
+from hat_ros.target.masks import overlap
 
 MIN_CONTRAST = 8.0  # 8-bit colour step across the outline below which there is no outline
 OPEN_BETTER = 0.012  # plausibility by which a cut that takes a liberty must beat the one that does not

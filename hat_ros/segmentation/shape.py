@@ -14,7 +14,7 @@ import numpy as np
 from hat_ros.array_types import Bool, Float, Float32, UInt8
 from hat_ros.cache import cached_arrays
 from hat_ros.geometry import lie
-from hat_ros.geometry.masks import mask_moments
+from hat_ros.target.masks import mask_moments
 from hat_ros.target.model import Target
 from hat_ros.target.rendering import Renderer
 from hat_ros.target.sphere import icosphere, look_along

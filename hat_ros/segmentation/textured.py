@@ -7,7 +7,6 @@ import numpy as np
 
 from hat_ros.array_types import UInt8
 from hat_ros.config import ClassicalConfig
-from hat_ros.geometry.masks import overlap
 from hat_ros.segmentation import region
 from hat_ros.segmentation.boundary import warm_up
 from hat_ros.segmentation.ground import GroundEvidence
@@ -22,6 +21,7 @@ from hat_ros.segmentation.search import (
     margin_px,
 )
 from hat_ros.segmentation.shape import SilhouetteBank
+from hat_ros.target.masks import overlap
 
 _MAX_AREA_CHANGE = 1.6  # from one frame to the next
 _MIN_CONTINUITY = 0.6  # overlap of a tracked mask with its seed

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from hat_ros.array_types import Float, UInt8
 from hat_ros.cache import cached_arrays
 from hat_ros.geometry import lie
-from hat_ros.geometry.masks import overlap
 from hat_ros.geometry.symmetry import Symmetry
 from hat_ros.target.exact_symmetry import symmetry_of
+from hat_ros.target.masks import overlap
 from hat_ros.target.model import Target
 from hat_ros.target.ray_renderer import RayRenderer
 from hat_ros.target.sphere import look_inwards

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from hat_ros.array_types import Bool, Float, Float32
 from hat_ros.cache import cached_arrays
-from hat_ros.geometry.masks import mask_moments
 from hat_ros.target.contour import COL_WEIGHT, contour_table
+from hat_ros.target.masks import mask_moments
 from hat_ros.target.model import Target
 from hat_ros.target.polar import MAX_RADIUS, N_RINGS, polar_grid, ring_weights
 from hat_ros.target.rendering import Renderer

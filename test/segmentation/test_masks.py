@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from hat_ros.geometry.masks import overlap
 from hat_ros.segmentation.masks import (
     Window,
     border_contact,
@@ -10,6 +9,7 @@ from hat_ros.segmentation.masks import (
     shift_between,
     touched_sides,
 )
+from hat_ros.target.masks import overlap
 
 RNG = np.random.default_rng(5)
 

@@ -2,9 +2,9 @@ import cv2
 import numpy as np
 import pytest
 
-from hat_ros.geometry.masks import overlap
 from hat_ros.segmentation import region
 from hat_ros.segmentation.masks import SIDES
+from hat_ros.target.masks import overlap
 
 _OUTWARD = {"left": (-1, 0), "right": (1, 0), "top": (0, -1), "bottom": (0, 1)}
 _WIDTH, _HEIGHT = 120, 90

@@ -5,9 +5,9 @@ from shape_scene import spacecraft
 
 from hat_ros.cache import cache_folder
 from hat_ros.geometry import lie
-from hat_ros.geometry.masks import mask_moments
 from hat_ros.target import view_bank
 from hat_ros.target.loading import target_from_scene
+from hat_ros.target.masks import mask_moments
 from hat_ros.target.ray_renderer import RayRenderer
 
 

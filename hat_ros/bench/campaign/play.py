@@ -21,9 +21,9 @@ from hat_ros.bench.synth.clips import render_clip, trajectory
 from hat_ros.bench.synth.mismatch import apply_mismatch
 from hat_ros.config import HatConfig
 from hat_ros.geometry import lie
-from hat_ros.geometry.masks import overlap
 from hat_ros.geometry.symmetry import Symmetry
 from hat_ros.target.exact_symmetry import symmetry_of
+from hat_ros.target.masks import overlap
 from hat_ros.target.model import Target
 from hat_ros.tracker import StageWrapper
 from hat_ros.types import MASK_SILHOUETTE, Frame

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from hat_ros.array_types import Bool, UInt8
-from hat_ros.geometry.masks import overlap
+from hat_ros.target.masks import overlap
 from hat_ros.tracker import Step
 
 Box = tuple[int, int, int, int]  # left, top, width, height

@@ -8,7 +8,7 @@ from hat_ros.bench.campaign.draw import View, draw_clip
 from hat_ros.bench.campaign.play import film_clip, play_clip
 from hat_ros.bench.synth.models import build_target
 from hat_ros.config import load_config
-from hat_ros.geometry.masks import overlap
+from hat_ros.target.masks import overlap
 
 TARGET = build_target("probe")
 CLIP = draw_clip(1, 5, ("probe",), View(4, 320, 240, 500.0))

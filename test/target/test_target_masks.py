@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hat_ros.geometry.masks import image_moments, mask_moments, overlap
+from hat_ros.target.masks import image_moments, mask_moments, overlap
 
 
 def test_overlap():
